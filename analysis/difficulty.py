@@ -286,6 +286,8 @@ def _measure(file: Path, seeds: int) -> str:
             finally:
                 spent.append(time.process_time() - started)
             rows.append(list(vars(world_difficulty(world, world.p_WS, world.p_WG, seed)).values()))
-    means = np.mean(rows, axis=0) if rows else np.full(len(fields(Difficulty)), np.nan)
-    columns = f"{f'{len(rows)}/{seeds}':>10}{np.mean(spent):>7.2f}"
+    feasible, rows = len(rows), rows or [[np.nan] * len(fields(Difficulty))]
+    known = np.isfinite(rows).sum(axis=0)  # measures that a world may not have
+    means = np.where(known > 0, np.nansum(rows, axis=0) / np.maximum(known, 1), np.nan)
+    columns = f"{f'{feasible}/{seeds}':>10}{np.mean(spent):>7.2f}"
     return columns + "".join(f"{mean:>8.2f}" for mean in means)

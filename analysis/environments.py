@@ -94,7 +94,7 @@ class Record:
     license: str
     path: str  # of an OctoMap; empty for the scene folder of that name
     digest: list[str]  # see `splits.source_digest`
-    made_of: str  # source and settings; another value makes the environment again
+    made_of: str  # source and settings
     size: list[float]  # [m], of the distance field
     free_volume: float  # [m^3]
     outdoor: bool
@@ -211,7 +211,10 @@ def make(
         print(f"== {name} ({number} of {len(chosen)}), from {sources[name]}", flush=True)
         made_of = " ".join([entry.source, *entry.settings, *overrides])
         found = read_index(scenes).get(name)
-        if found is not None and found.made_of == made_of:
+        if found is not None:
+            remedy = "choose another --out, or remove its record and folder"
+            settings = f"settings of {name} in {scenes / INDEX}"
+            require(found.made_of == made_of, settings, made_of, found.made_of, remedy)
             print(f"{name}: is recorded already", flush=True)
             continue
         started = time.process_time()

@@ -172,4 +172,8 @@ def project(camera: OnboardCamera, p_BQ: np.ndarray) -> np.ndarray:
     p_CQ = p_CQ[p_CQ[:, 2] > _NEAR]
     center = np.array([camera.width, camera.height]) / 2
     focal = np.array([camera.focal_x, camera.focal_y])
-    return center + focal * p_CQ[:, :2] / p_CQ[:, 2:]
+    slopes = p_CQ[:, :2] / p_CQ[:, 2:]
+    if camera.distortion is not None:
+        slopes = camera.distortion.project(slopes)
+        slopes = slopes[np.isfinite(slopes[:, 0])]
+    return center + focal * slopes

@@ -209,7 +209,7 @@ def generated_viewpoints(config: GapConfig) -> Iterator[Viewpoint]:
     step = 0.5 * config.speed / _IMAGE_RATE  # [m] between images
     kinds = list(islice(cycle(config.generated), config.viewpoints))
     for i, kind in enumerate(Progress(kinds, "making worlds")):
-        seed = MONTE_CARLO_SEEDS[config.seed] + i
+        seed = MONTE_CARLO_SEEDS[config.seed * config.viewpoints + i]
         world, rng = make_world(scenario_world(kind), seed), np.random.default_rng([seed, 1])
         lower, upper = world.esdf.lower_W, world.esdf.upper_W
         back = step * np.arange(config.frames - 1, -1, -1)[:, None]

@@ -75,6 +75,8 @@ def run(
     *, out: Path, policies: Sequence[str], seeds: int, effect_seeds: int, split: str = "test"
 ) -> list[dict[str, Any]]:
     """Flies `seeds` flights of each scenario and profile, and `effect_seeds` of each effect."""
+    require(seeds >= 1, "--seeds", "at least 1", seeds)
+    require(0 <= effect_seeds <= seeds, "--effect-seeds", f"in [0, {seeds}]", effect_seeds)
     scenarios = [name for name in benchmark_scenarios() if name.startswith("P")]
     profiles = {name: [] if name == "ideal" else [f"profile={name}"] for name in PROFILES}
     table, ideal, first = [], [], ""
@@ -100,5 +102,5 @@ if __name__ == "__main__":
     released = [name for name in POLICIES.registered() if name not in _UNFLOWN]
     parser.add_argument("--policies", type=lambda text: text.split(","), default=released)
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--effect-seeds", type=int, default=2)
+    parser.add_argument("--effect-seeds", type=int, default=1)
     run(**vars(parser.parse_args()))

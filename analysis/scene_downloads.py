@@ -5,13 +5,16 @@ in a folder of that name, which is a scene folder too.
 """
 
 import json
+import re
 import shutil
 import urllib.error
 import urllib.request
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
+from http.client import HTTPException
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 
@@ -68,7 +71,7 @@ def pack(*, names: Sequence[str], scenes: Path, out: Path) -> dict[str, PackedSc
         if name not in records:
             raise ValueError(unknown(f"scene in {scenes / INDEX}", name, records))
         license, remedy = records[name].license, "share only what the license allows"
-        free = license and "non-commercial" not in license
+        free = license and not re.search(r"\bnc\b|non-?commercial", license, re.IGNORECASE)
         require(free, f"license of {name}", "a free one", license or "none", remedy)
         require(not records[name].path, name, "a scene folder", "an OctoMap", "share its file")
     file = out / LIST
@@ -122,7 +125,7 @@ def get(*, names: Sequence[str], source: str, scenes: Path) -> dict[str, PackedS
             continue
         with folder_written_atomically(target) as folder:
             for file, about in Progress(packed.files.items(), f"getting {name}", unit="file"):
-                url = f"{base}/{name}/{file}"
+                url = f"{base}/{quote(name)}/{file}"
                 content = _fetch(url, about.bytes)
                 digest, remedy = sha256(content).hexdigest(), "get it again"
                 require(digest == about.sha256, f"digest of {url}", about.sha256, digest, remedy)
@@ -153,7 +156,7 @@ def _fetch(url: str, size: int) -> bytes:
     try:
         with urllib.request.urlopen(url, timeout=_TIMEOUT) as answer:
             content = answer.read(size + 1)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, HTTPException) as error:
         reason = getattr(error, "reason", error)
         raise OSError(f"cannot read {url}: {reason}; check --from, and proxy and network") from None
     require(len(content) <= size, f"size of {url}", f"at most {size} bytes", "more", "get it again")

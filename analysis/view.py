@@ -12,7 +12,12 @@ from pydrake.geometry import Rgba
 from scipy.spatial import KDTree
 
 from splatpilot.diagrams.flight.flight_diagram import empty_meshcat
-from splatpilot.diagrams.flight.scenario import Scenario, goal_position, start_position
+from splatpilot.diagrams.flight.scenario import (
+    Scenario,
+    goal_position,
+    sample_scenario,
+    start_position,
+)
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.file_worlds import OCTOMAP
 from splatpilot.diagrams.worlds.scene_folder import (
@@ -114,6 +119,7 @@ def _may_hold_gaussians(path: Path) -> bool:
 
 def _generated(scenario: Scenario) -> ViewerScene:
     scenario.validate()
+    scenario = sample_scenario(scenario)
     world = make_world(scenario.world, scenario.seed)
     ends = start_position(scenario, world), goal_position(scenario, world)
     return _show_world(world, f"{world.name}, seed {scenario.seed}", ends)

@@ -110,14 +110,19 @@ def keep_realism(folders: Sequence[Path]) -> None:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+    commands, programs = [], set[str]()
+    for folder in folders:
+        ideal = StudyFolder(folder / "ideal")
+        config, effects = ideal.config(), folder.glob("*/study.yaml")
+        fewest = min(StudyFolder(path.parent).config().seeds for path in effects)
+        options = f"--policies {','.join(config.policies)} --seeds {config.seeds}"
+        command = f"python -m splatpilot.analysis.realism {folder} {options}"
+        commands.append(f"{command} --effect-seeds {fewest}")
+        programs.add(ideal.program()["splatpilot"])
+    (program,) = programs
     flown = (folders[0] / "realism.csv").stat().st_mtime
-    ideal = StudyFolder(folders[0] / "ideal")
-    program, seeds = ideal.program()["splatpilot"], ideal.config().seeds
-    effects = [path.parent for path in folders[0].glob("*/study.yaml")]
-    effect_seeds = min(StudyFolder(path).config().seeds for path in effects)
-    command = f"python -m splatpilot.analysis.realism out/realism --seeds {seeds}"
-    about = {"command": f"{command} --effect-seeds {effect_seeds}"}
-    about |= {"date": date.fromtimestamp(flown).isoformat(), "program": program}
+    about = {"command": "; ".join(commands), "date": date.fromtimestamp(flown).isoformat()}
+    about |= {"program": program}
     (RESULTS / "realism.yaml").write_text(yaml.safe_dump(about, sort_keys=False))
 
 

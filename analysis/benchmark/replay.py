@@ -10,7 +10,12 @@ import numpy as np
 
 from splatpilot.analysis.benchmark.rollout import digest, study_world
 from splatpilot.analysis.benchmark.study import RolloutSpec
-from splatpilot.analysis.benchmark.study_folder import StudyFolder, kept_flights, plugin_digests
+from splatpilot.analysis.benchmark.study_folder import (
+    StudyFolder,
+    input_digests,
+    kept_flights,
+    plugin_digests,
+)
 from splatpilot.analysis.benchmark.tables import Row
 from splatpilot.analysis.benchmark.variants import LIVE
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
@@ -141,8 +146,9 @@ def _read_flight(folder: StudyFolder, id: str) -> tuple[RolloutSpec, Row, dict[s
 
 
 def _likely_reason(folder: StudyFolder, spec: RolloutSpec, scenario: Scenario) -> str:
-    recorded = folder.program()
-    for name, version in (program() | plugin_digests([scenario])).items():
+    recorded, inputs = folder.program(), input_digests(folder.config(), {spec.scenario: scenario})
+    scenes = {name: each for name, each in inputs.items() if name.startswith("scene of")}
+    for name, version in (program() | plugin_digests([scenario]) | scenes).items():
         if recorded.get(name) != version:
             return f"It was flown by {name} {recorded.get(name, 'unknown')}, this is {version}"
     host = folder.read_timing(spec.id).get("host", "an unknown machine")

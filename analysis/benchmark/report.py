@@ -30,7 +30,6 @@ from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.provenance import SPLIT_NAMES, describe_seeds
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
 
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
@@ -346,7 +345,7 @@ def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[Row]) -> 
     )
     points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), p_WG[2])], axis=-1)
     distance = np.minimum(np.nan_to_num(field.distance(points), nan=np.inf), 10.0)
-    levels = [-1e3, 0.0, VEHICLE_RADIUS]
+    levels = [-1e3, 0.0, scenario.vehicle.radius]
     axes.contourf(x, y, distance, levels=levels, colors=[_OBSTACLE, _BLOCKED])
     p_WS = world.p_WS
     for policy, color in zip(config.policy_names, cycle(_COLORS), strict=False):

@@ -1,5 +1,6 @@
 """One flight of a study, as worker processes fly it."""
 
+import contextlib
 import functools
 import hashlib
 import io
@@ -168,9 +169,11 @@ def _fly_rollout(
         diagram = BuildFlightDiagram(scenario, world, camera=False, policy=policy)
         flight = fly(diagram)
         ends = tuple(start_position(scenario, world)), tuple(goal_position(scenario, world))
-        lengths = _lengths_to(world, ends[1])
-        p_WS = QuadrotorState.of(flight.states[0]).p_WB
-        shortest = shortest_length(lengths, p_WS, scenario.goal_radius)
+        shortest = math.nan
+        with contextlib.suppress(InfeasibleFlightError):  # for larger vehicles than this one
+            lengths = _lengths_to(world, ends[1])
+            p_WS = QuadrotorState.of(flight.states[0]).p_WB
+            shortest = shortest_length(lengths, p_WS, scenario.goal_radius)
         metrics = flight_metrics(flight, shortest) | {"digest": digest(flight)}
         metrics |= _difficulty(world, *ends, scenario.seed)
         if flight.reason:  # timing the policy could raise again

@@ -89,6 +89,9 @@ def fly_all(
             "one with `dask scheduler` and workers with `dask worker ADDRESS --nthreads 1`"
         ) from None
     with client:
+        for worker, found in client.run(program).items():
+            remedy = "install the same version there"
+            require(found == program(), f"program of worker {worker}", program(), found, remedy)
         futures = client.map(fly, list(work), pure=False, retries=3)
         try:
             for _, rollouts in distributed.as_completed(futures, with_results=True):

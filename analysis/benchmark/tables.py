@@ -82,7 +82,7 @@ def cluster_interval(
     if len(k) < 2:
         return Interval(0.0, 1.0)
     if np.ptp(k / n) == 0:
-        return wilson_interval(round(float(k.sum() / n.sum()) * len(k)), len(k), confidence)
+        return wilson_interval(float(k.sum() / n.sum()) * len(k), len(k), confidence)
     drawn = np.random.default_rng(0).integers(len(k), size=(_RESAMPLES, len(k)))
     rates = k[drawn].sum(axis=1) / n[drawn].sum(axis=1)
     lower, upper = np.quantile(rates, [(1 - confidence) / 2, (1 + confidence) / 2])
@@ -106,9 +106,10 @@ def sign_flip(differences: ArrayLike) -> float:
     if len(d) <= _MAX_EXACT:
         bits = np.arange(2 ** len(d))[:, None] >> np.arange(len(d)) & 1
     else:
-        bits = np.random.default_rng(0).integers(2, size=(2**_MAX_EXACT, len(d)))
+        bits = np.random.default_rng(0).integers(2, size=(2**_MAX_EXACT, len(d)), dtype=np.uint8)
         bits[0] = 0  # the observation
-    sums = np.abs((1 - 2 * bits) @ d)
+    parts = np.array_split(bits, 1 + bits.size // 2**22)  # whose floats fit in memory
+    sums = np.abs(d.sum() - 2.0 * np.concatenate([part @ d for part in parts]))
     return float(np.mean(sums >= abs(d.sum()) - 1e-12))
 
 

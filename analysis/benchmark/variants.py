@@ -80,7 +80,7 @@ class ScenarioVariant(NamedTuple):
     @property
     def base(self) -> str:
         """The name of the scenario without the changes."""
-        return Path(self.scenario).stem
+        return re.sub(r"\.ya?ml$", "", self.scenario)
 
     @property
     def world(self) -> tuple[str, ...]:
@@ -105,7 +105,7 @@ def parse_scenario(text: str) -> ScenarioVariant:
         label, rest = "", text
     scenario, *overrides = re.split(f":(?={_FIELD})", rest)
     if not label:
-        label = default_label(Path(scenario).stem, overrides)
+        label = default_label(re.sub(r"\.ya?ml$", "", Path(scenario).name), overrides)
     inner = [each.removeprefix("policy.") for each in overrides if each.startswith("policy.")]
     others = [each for each in overrides if not each.startswith("policy.")]
     return ScenarioVariant(label, scenario, tuple(others), tuple(inner))

@@ -58,6 +58,7 @@ from splatpilot.systems.visualization.pages import (
     HtmlPage,
     ReplayedFlight,
     ReplayView,
+    jpeg,
     live_page,
     replay_page,
 )
@@ -73,7 +74,8 @@ def replayed_flight(name: str, flight: Flight, frames: Frames | None) -> Replaye
 
 def recorded_frames(recorder: VideoRecorder, scenario: Scenario) -> Frames:
     """Returns the images of the scenario's camera."""
-    color, depth = zip(*recorder.frames(scenario.camera.z_far), strict=True)
+    frames = recorder.frames(scenario.camera.z_far)
+    color, depth = zip(*(map(jpeg, pictures) for pictures in frames), strict=True)
     return Frames(1 / scenario.camera.fps, color, depth, scenario.camera.z_far)
 
 

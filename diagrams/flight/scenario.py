@@ -244,7 +244,7 @@ def _check_free(world: World, what: str, p_WQ: np.ndarray, radius: float) -> Non
             f"{where} is {known}, which spans {np.round(field.lower_W, 2).tolist()} to "
             f"{np.round(field.upper_W, 2).tolist()} m; choose a point in known free space"
         )
-    if sample.distance <= radius:
+    if sample.distance <= radius or sample.state != FieldState.FREE:
         raise InfeasibleFlightError(
             f"{where} is {float(sample.distance):.3f} m from the nearest surface, but the "
             f"vehicle's radius is {radius} m; choose a point with more clearance"

@@ -99,7 +99,8 @@ class FlightError(ValueError):
 
 
 def make_flight_simulator(diagram: Diagram, generator: RandomGenerator | None = None) -> Simulator:
-    """Makes a simulator of a diagram with a `FlightMonitor`, as its scenario says.
+    """Makes a simulator of a diagram with a `FlightMonitor`, as its scenario says; of several, as
+    that with the smallest step.
 
     The Context is that of SetRandomContext with the generator, by default of the scenario's seed,
     so that Drake's random sources repeat. All else that is random follows from the scenario's seed
@@ -109,9 +110,10 @@ def make_flight_simulator(diagram: Diagram, generator: RandomGenerator | None = 
     Raises:
         ValueError: if the diagram has no `FlightMonitor`.
     """
-    scenario = _require_monitors(diagram)[0][1].scenario
-    simulator = Simulator(diagram)
-    ApplySimulatorConfig(scenario.simulator, simulator)
+    scenarios = [system.scenario for _, system in _require_monitors(diagram)]
+    scenario, simulator = scenarios[0], Simulator(diagram)
+    finest = min((each.simulator for each in scenarios), key=lambda each: each.max_step_size)
+    ApplySimulatorConfig(finest, simulator)
     root = simulator.get_mutable_context()
     diagram.SetRandomContext(root, generator or RandomGenerator(scenario.seed))
     root.SetAccuracy(_ACCURACY)
@@ -161,9 +163,24 @@ def fly_all(
     A vehicle whose flight has ended flies on until the last one has. Exceptions are those of `fly`
     and hold the first flight that had not ended.
     """
+    while True:
+        flights = _fly_once(diagram, monitor, progress, realtime_rate)
+        if flights is not None:
+            return flights
+
+
+def _fly_once(
+    diagram: Diagram,
+    monitor: Callable[[Context], EventStatus | None] | None,
+    progress: Callable[[float], object] | None,
+    realtime_rate: float,
+) -> dict[str, Flight] | None:
+    """Simulates all flights of a diagram, see `fly_all`; returns None to begin again."""
     monitors = {
         system.get_name(): (parent, system) for parent, system in _require_monitors(diagram)
     }
+    names = [system.get_name() for _, system in _require_monitors(diagram)]
+    require(len(monitors) == len(names), "names of FlightMonitors", "different", names)
     simulator = make_flight_simulator(diagram)
     simulator.set_target_realtime_rate(realtime_rate)
     root = simulator.get_mutable_context()
@@ -215,9 +232,7 @@ def fly_all(
             status = simulator.AdvanceTo(min(end, limit))
             record()
             if status.message() == RESTART:
-                return fly_all(
-                    diagram, monitor=monitor, progress=progress, realtime_rate=realtime_rate
-                )
+                return None
             near = end < limit and status.reason() == _BOUNDARY
             if not near and not isinstance(status.system(), FlightMonitor):
                 break

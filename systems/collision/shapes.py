@@ -257,10 +257,10 @@ class MovingSpheres(SpheresInTime):
 
 
 class FieldWithSpheres:
-    """The union of a distance field and spheres, whose centers are infinite if absent."""
+    """The union of a distance field and spheres, without those of infinite centers or radius 0."""
 
     def __init__(self, field: DistanceField, centers: NDArray, radii: NDArray) -> None:
-        present = np.isfinite(centers).all(axis=1)
+        present = np.isfinite(centers).all(axis=1) & (np.asarray(radii) > 0.0)
         self._field = field
         rows = np.zeros((np.count_nonzero(present), _ROW))
         rows[:, :3], rows[:, 3] = centers[present], radii[present]

@@ -5,6 +5,7 @@ H has its origin in the vehicle, z up and x above the body's x axis. Leading dim
 batches.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, cast
@@ -155,7 +156,7 @@ class Policy(LeafSystem):
     def __init__(self, config: Any, image: str = "") -> None:
         super().__init__(converter=_PolicyByValues.converter())
         config.validate()
-        self.config, self.image = config, image
+        self.config, self.image = copy.deepcopy(config), image
         self.state_outputs: dict[str, DiscreteStateIndex] = {}
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self._goal_port = self.DeclareVectorInputPort("goal", 3)

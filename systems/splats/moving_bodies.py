@@ -140,7 +140,8 @@ class MovingBodies(LeafSystem):
         X_WO = cast(RigidTransform, self.get_input_port(body).Eval(context))
         q_WO, time = X_WO.rotation().ToQuaternion().wxyz(), context.get_time()
         held = np.asarray(context.get_discrete_state(body).value()).reshape(-1, _ROW)
-        return np.vstack([held[held[:, 0] < time], np.hstack([time, X_WO.translation(), q_WO])])
+        before = held[held[:, 0] < time - 1e-6]  # not of this event, whose times are rounded
+        return np.vstack([before, np.hstack([time, X_WO.translation(), q_WO])])
 
     def _remember(self, context: Context, discrete_state: DiscreteValues) -> None:
         for body in range(len(self._bodies)):

@@ -305,6 +305,7 @@ def FlatnessController_(T):
             self.DeclareStateOutputPort("command", self.DeclareDiscreteState(hover))
             if config.disturbance_time > 0.0:
                 self.DeclareDiscreteState(6)
+                self.DeclareInitializationDiscreteUpdateEvent(self._begin)
             self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._update)
 
         SetLookahead = parameter_setter("lookahead")
@@ -318,6 +319,12 @@ def FlatnessController_(T):
         SetYawSpeed = parameter_setter("yaw_speed")
         SetDrag = parameter_setter("drag")
         SetGravity = parameter_setter("gravity")
+
+        def _begin(self, context, discrete_state):
+            v_WB = vector_input(self, "state", context)[3:6]
+            if T is float and not np.isfinite(v_WB).all():  # of no vehicle yet
+                v_WB = np.zeros(3)
+            discrete_state.set_value(1, np.append(v_WB, np.zeros(3)))
 
         def _update(self, context, discrete_state):
             config, params = (each.config(context) for each in self._parameters)

@@ -15,7 +15,12 @@ from pydrake.systems.framework import (
 from scipy.linalg import block_diag, cholesky, expm, solve_continuous_lyapunov
 
 from splatpilot.systems.common.distributions import draw
-from splatpilot.systems.common.drake import ConfigParameter, parameter_setter, system_template
+from splatpilot.systems.common.drake import (
+    ConfigParameter,
+    float_values,
+    parameter_setter,
+    system_template,
+)
 from splatpilot.systems.common.validation import (
     Config,
     bounded,
@@ -127,7 +132,9 @@ def DrydenWind_(T):
             return np.array(draw(normal, self._seed, f"wind {name}"))
 
         def _update(self, context, discrete_state):
-            step = round(float(context.get_time()) / self._period)
+            time = context.get_time()
+            time = time.Evaluate() if T is Expression else float_values(time)
+            step = round(float(time) / self._period)
             x = context.get_discrete_state_vector().value()
             discrete_state.set_value(self._A @ x + self._B @ self._noise(step))
 

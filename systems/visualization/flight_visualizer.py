@@ -189,7 +189,9 @@ _RIBBON_WIDTH = 0.02  # [m]
 
 def hypothesis_colors(costs: np.ndarray) -> np.ndarray:
     """Returns colors (K, 3), 0 to 1, of costs (K,): green (lowest) to red (highest)."""
-    cost = (costs - costs.min()) / max(np.ptp(costs), 1e-9)
+    known = np.isfinite(costs)  # others are the highest
+    lowest, highest = (f(costs[known]) if known.any() else 0.0 for f in (np.min, np.max))
+    cost = np.where(known, (np.where(known, costs, 0.0) - lowest) / max(highest - lowest, 1e-9), 1)
     return np.column_stack(
         [np.minimum(1, 2 * cost), np.minimum(1, 2 * (1 - cost)), np.full(len(cost), 0.1)]
     )

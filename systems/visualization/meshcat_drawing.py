@@ -1,6 +1,7 @@
 """Drawing in Meshcat: world, goal, vehicle, distances, hypotheses and camera images."""
 
 import json
+import math
 from typing import cast
 
 import cv2
@@ -142,7 +143,9 @@ def distance_slice(
 
 def draw_distance_slice(meshcat: Meshcat, path: str, field: DistanceField, height: float) -> None:
     """Draws the `distance_slice` of a field at z = `height` [m], blue from 2 m on."""
-    p_WQ, faces, colors = distance_slice(field, height, spacing=0.2, max_distance=2.0)
+    area = np.prod((field.upper_W - field.lower_W)[:2])
+    spacing = max(0.2, math.sqrt(area / _SLICE_POINTS))
+    p_WQ, faces, colors = distance_slice(field, height, spacing, max_distance=2.0)
     meshcat.SetTriangleColorMesh(path, p_WQ.T, faces.T, colors.T)
 
 
@@ -152,6 +155,7 @@ def vehicle_prefix(system: System, base: str) -> str:
     return "" if name == base else name.removesuffix(f"_{base}")
 
 
+_SLICE_POINTS = 40_000  # [-] of a slice, at most
 _PICTURE_DEPTH = 0.6  # [m] from the camera to the shown image
 _DEPTH_POINTS = 10_000  # [-] at most
 

@@ -81,14 +81,14 @@ def splat_page(
         mirrored = EnvironmentMap(background.texels[:, ::-1])
         sky = base64.b64encode(mirrored.png()).decode()
     sources = [_source(name) for name in ("splats.js", *scripts, "page.js")]
-    data = {"name": title, **data}
+    content = json.dumps({"name": title, **data}, allow_nan=False).encode()
     sources.append(f"openPage().then(({{splats, data}}) => {{ {start} }});")
     added = (
         f"<style>{_source('page.css')}</style>"
         f'<script type="text/plain" id="gaussians">'
         f"{compressed(pack_gaussians(gaussians).tobytes())}</script>"
         f'<script type="text/plain" id="sky">{sky}</script>'
-        f'<script type="text/plain" id="data">{compressed(json.dumps(data).encode())}</script>'
+        f'<script type="text/plain" id="data">{compressed(content)}</script>'
     ) + "".join(f"<script>{source}</script>" for source in sources)
     meshcat_page = meshcat_page.replace(
         "<title>Drake MeshCat</title>", f"<title>{escape(title)}</title>{_VIEWPORT}", 1
@@ -119,8 +119,9 @@ def compressed(data: bytes) -> str:
 
 
 def rounded(values: NDArray[np.floating]) -> list:
-    """Rounds numbers to 0.1 mm, as nested lists."""
-    return np.round(values, 4).tolist()
+    """Rounds numbers to 0.1 mm, as nested lists; None stands for those that are not finite."""
+    numbers = np.round(values, 4)
+    return np.where(np.isfinite(numbers), numbers, None).tolist()
 
 
 def jpeg(image: NDArray[np.uint8]) -> str:
@@ -256,8 +257,8 @@ class Frames:
     """Images of the onboard camera from the start on."""
 
     period: float  # [s]
-    color: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, BGR
-    depth: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, BGR, see `colorize_depth`
+    color: Sequence[str]  # see `jpeg`
+    depth: Sequence[str]  # the same, of `colorize_depth`
     max_depth: float = 20.0  # [m], see `colorize_depth`
 
 
@@ -356,13 +357,13 @@ def _flight_data(flight: ReplayedFlight, color: str) -> dict[str, Any]:
         "p_WB": rounded(state.p_WB),
         "q_WB": rounded(state.q_WB),
         "speeds": rounded(np.linalg.norm(state.v_WB, axis=1)),
-        "clearances": [None if np.isnan(c) else round(c, 3) for c in flight.clearances[rows]],
+        "clearances": rounded(flight.clearances[rows]),
         "plans": _plans(flight.hypotheses),
         "frames": flight.frames
         and {
             "period": flight.frames.period,
-            "color": [jpeg(image) for image in flight.frames.color],
-            "depth": [jpeg(image) for image in flight.frames.depth],
+            "color": list(flight.frames.color),
+            "depth": list(flight.frames.depth),
         },
     }
 

@@ -28,9 +28,9 @@ from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.systems.visualization.flight_visualizer import hypothesis_colors
+from splatpilot.systems.visualization.video import TOO_FAR
 
 _JPEG_QUALITY = 80
-_TOO_FAR = np.iinfo(np.uint16).max  # of Drake's images of depth [mm]
 _CAMERA = "world/vehicle/camera"
 # The curves, and the names of their components
 _CURVES = {
@@ -241,7 +241,7 @@ class RerunSink(LeafSystem):
 
     def _log_depth(self, image: Any) -> None:
         depth = np.asarray(image.data)[..., 0]
-        png = cv2.imencode(".png", np.where(depth == _TOO_FAR, 0, depth))[1].tobytes()
+        png = cv2.imencode(".png", np.where(depth == TOO_FAR, 0, depth))[1].tobytes()
         encoded = self._rr.EncodedDepthImage(blob=png, media_type="image/png", meter=1e3)
         self._recording.log(f"{_CAMERA}/depth", encoded)
 

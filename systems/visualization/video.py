@@ -1,5 +1,6 @@
 """VideoRecorder: video of a camera, color next to depth."""
 
+import os
 import tempfile
 from collections.abc import Iterator
 from fractions import Fraction
@@ -16,6 +17,8 @@ from pydrake.systems.sensors import ImageDepth16U, ImageRgba8U
 
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.splats.splat_camera import SplatCamera
+
+TOO_FAR = np.iinfo(np.uint16).max  # of Drake's images of depth [mm]
 
 
 class VideoRecorder(LeafSystem):
@@ -37,7 +40,7 @@ class VideoRecorder(LeafSystem):
         self._frame = np.dtype(
             [("rgb", np.uint8, (height, width, 3)), ("depth", np.uint16, (height, width))]
         )
-        self._file = tempfile.TemporaryFile(buffering=0)
+        self._file, self._count = tempfile.TemporaryFile(buffering=0), 0
         self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U(width, height)))
         self.DeclareAbstractInputPort("depth_image_16u", Value(ImageDepth16U(width, height)))
         self.DeclareInitializationPublishEvent(self._clear)
@@ -62,6 +65,7 @@ class VideoRecorder(LeafSystem):
     def _clear(self, context: Context) -> EventStatus:
         self._file.seek(0)
         self._file.truncate()
+        self._count = 0
         return EventStatus.Succeeded()
 
     def _record(self, context: Context) -> EventStatus:
@@ -78,6 +82,7 @@ class VideoRecorder(LeafSystem):
                 "name another folder by TMPDIR, or record fewer and smaller ones (camera.fps, "
                 "camera.width)"
             ) from None
+        self._count += 1
         return EventStatus.Succeeded()
 
     def frames(self, max_depth: float) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
@@ -86,11 +91,11 @@ class VideoRecorder(LeafSystem):
         Args:
             max_depth: [m], see `colorize_depth`.
         """
-        frames = self._file.tell() // self._frame.itemsize
-        self._file.seek(0)
-        for _ in range(frames):
-            frame = np.frombuffer(self._file.read(self._frame.itemsize), self._frame)[0]
-            yield frame["rgb"][..., ::-1], colorize_depth(frame["depth"] * 1e-3, max_depth)
+        size = self._frame.itemsize
+        for k in range(self._count):
+            frame = np.frombuffer(os.pread(self._file.fileno(), size, k * size), self._frame)[0]
+            depth = np.where(frame["depth"] < TOO_FAR, frame["depth"] * 1e-3, np.inf)
+            yield frame["rgb"][..., ::-1], colorize_depth(depth, max_depth)
 
     def save(self, path: Path, max_depth: float) -> None:
         """Writes the video (H.264 in MP4) atomically; `max_depth` as in `frames`."""
@@ -99,7 +104,7 @@ class VideoRecorder(LeafSystem):
 
     def _check(self, path: Path) -> None:
         """Raises OSError if a video is incomplete: its writer ignores full disks."""
-        recorded = self._file.tell() // self._frame.itemsize
+        recorded = self._count
         with av.open(str(path)) as container:
             found = sum(packet.size > 0 for packet in container.demux(video=0))
         if found != recorded:

@@ -119,6 +119,9 @@ def test_infeasible_seeds_are_counted_and_a_missing_scene_is_not_run(small, monk
     assert "not run" in lines[2] and "TartanAir" in lines[2]
     infeasible.add(0)
     assert "0/2" in run(scenarios=[small], seeds=2)[1]
+    infeasible.clear()
+    # Seed 0 has one obstacle, and no gap.
+    assert "nan" not in run(scenarios=["P12"], seeds=2)[1]
 
 
 def test_a_closed_wall_leaves_no_path():

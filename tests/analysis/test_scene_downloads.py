@@ -95,6 +95,15 @@ def test_scenes_that_cannot_be_shared_are_not_packed(run, capsys, name, message)
     assert re.search(message, capsys.readouterr().err)
 
 
+@pytest.mark.parametrize("license", ["CC-BY-NC-4.0", "Non-Commercial use", "noncommercial"])
+def test_scenes_of_other_licenses_are_not_packed(run, monkeypatch, capsys, license):
+    index = json.loads(Path(INDEX).read_text())
+    index["shed"]["license"] = license
+    Path(INDEX).write_text(json.dumps(index))
+    assert run("library pack shed --out packed") != 0
+    assert "license of shed must be a free one" in capsys.readouterr().err
+
+
 def test_damaged_and_foreign_scenes_are_refused(run, capsys):
     def refused(message: str) -> bool:
         status = run("library get shed --out got --from packed")

@@ -5,7 +5,6 @@
 // goes from `lower` to `upper` [m].
 function showLive(splats, {name, url, lower, upper, cut, fov_y}) {
   const THREE = MeshCat.THREE;
-  viewer.camera.far = 1000;
   // Meshcat's points of the same Gaussians.
   viewer.set_property(["splatpilot", "scene"], "visible", false);
   // Meshcat's messages about the background do not replace the sky.

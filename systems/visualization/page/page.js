@@ -42,6 +42,7 @@ function addElement(parent, tag, properties = {}) {
 // Calls a function of `keys`, by the names of keys.
 function bindKeys(keys) {
   document.addEventListener("keydown", (event) => {
+    if (event.target.matches?.("input[type=text], input[type=number], textarea")) return;
     if (event.ctrlKey || event.altKey || event.metaKey || !(event.key in keys)) return;
     event.preventDefault();
     keys[event.key]();
@@ -142,6 +143,7 @@ function lookAt(eye, target) {
 
 // Shows the Gaussians and the sky; returns the former and the page's other data.
 async function openPage() {
+  viewer.camera.far = 1000;
   const splats = new Splats(viewer, new Uint32Array(await unpack("gaussians")));
   viewer.scene.add(splats.mesh);
   showSky();

@@ -106,10 +106,11 @@ class ReplayFlight {
     this.shownPlan = index;
     this.shownNearest = nearest;
     const {p_WB, waypoints_W, costs} = this.plans[index];
-    const lowest = Math.min(...costs), span = Math.max(Math.max(...costs) - lowest, 1e-9);
+    const known = costs.filter((cost) => cost !== null);  // others are infinite
+    const lowest = Math.min(...known), span = Math.max(Math.max(...known) - lowest, 1e-9);
     const positions = [], colors = [], halfWidth = 0.012;
     waypoints_W.forEach((waypoints, k) => {
-      const share = (costs[k] - lowest) / span;
+      const share = costs[k] === null ? 1 : (costs[k] - lowest) / span;
       const color = new THREE.Color(Math.min(1, 2 * share), Math.min(1, 2 * (1 - share)), 0.1)
         .convertSRGBToLinear();
       let a = p_WB;

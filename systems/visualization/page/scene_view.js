@@ -20,7 +20,8 @@ class SceneView {
       this.slice = new DistanceSlice(data.grid, values);
       viewer.scene.add(this.slice.mesh);
     }
-    viewer.camera.far = 1000;
+    const size = Math.hypot(...data.upper.map((x, axis) => x - data.lower[axis]));
+    viewer.camera.far = Math.max(1000, 20 * size);
     viewer.controls.maxPolarAngle = 0.5 * Math.PI;  // above ground
     this.switches = {};
     this.build();

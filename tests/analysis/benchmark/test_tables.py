@@ -62,6 +62,7 @@ def test_cluster_interval_covers_at_its_confidence():
         ([20], [20], (0.0, 1.0)),
         ([20, 20, 20], [20, 20, 20], wilson_interval(3, 3)),
         ([0, 0], [5, 5], wilson_interval(0, 2)),
+        ([5, 5, 5], [10, 10, 10], wilson_interval(1.5, 3)),  # not two of three
     ],
 )
 def test_cluster_interval_of_equal_or_single_scenarios_is_wide(successes, flights, expected):

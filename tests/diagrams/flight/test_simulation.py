@@ -9,19 +9,30 @@ from gymnasium.spaces import Box
 from pydrake.common import RandomGenerator
 from pydrake.gym import DrakeGymEnv
 from pydrake.systems.analysis import MonteCarloSimulation
-from pydrake.systems.framework import EventStatus, LeafSystem
+from pydrake.systems.framework import DiagramBuilder, EventStatus, LeafSystem
 
-from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.flight_diagram import AddFlight, BuildFlightDiagram
 from splatpilot.diagrams.flight.fly import flight_page
 from splatpilot.diagrams.flight.monitor import flight_outcome
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
-from splatpilot.diagrams.flight.simulation import FlightError, Outcome, fly, random_flights
+from splatpilot.diagrams.flight.simulation import (
+    FlightError,
+    Outcome,
+    fly,
+    fly_all,
+    random_flights,
+)
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.provenance import MONTE_CARLO_SEEDS, InfeasibleFlightError
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant, hover_state
+from splatpilot.systems.vehicle.quadrotor import (
+    VEHICLE_RADIUS,
+    QuadrotorParams,
+    QuadrotorPlant,
+    hover_state,
+)
 from splatpilot.systems.visualization.live import RESTART
 
 
@@ -76,6 +87,49 @@ def test_monitor_restarts_a_flight(post_world):
     assert flight.outcome == Outcome.TIMEOUT
     np.testing.assert_allclose(flight.times[[0, -1]], [0.0, 0.5], atol=1e-9)
     assert (np.diff(flight.times) > 0).all()
+
+
+def test_a_restarted_flight_that_is_interrupted_is_the_second_one(post_world):
+    diagram = BuildFlightDiagram(Scenario(timeout=2.0), post_world, camera=False)
+    times = []
+
+    def watch(context):
+        times.append(context.get_time())
+        if times.count(0.0) == 2 and times[-1] > 0.6:
+            raise KeyboardInterrupt
+        again = times.count(0.0) == 1 and times[-1] > 0.2
+        return EventStatus.ReachedTermination(diagram, RESTART) if again else None
+
+    with pytest.raises(KeyboardInterrupt) as interrupted:
+        fly(diagram, monitor=watch)
+    assert vars(interrupted.value)["flight"].times[-1] > 0.5
+
+
+def test_the_smallest_step_is_that_of_all_flights(post_world):
+    agile = Scenario(timeout=0.5, vehicle=QuadrotorParams(motor_time_constant=0.005))
+    agile.simulator.max_step_size, agile.start = 0.005, [1.0, 1.5, 2.0]
+    for first, second in ((Scenario(timeout=0.5), agile), (agile, Scenario(timeout=0.5))):
+        builder = DiagramBuilder()
+        parts = AddFlight(builder, first, post_world, name="a", camera=False)
+        AddFlight(builder, second, post_world, name="b", camera=False, others=[parts])
+        flights = fly_all(builder.Build())
+        assert {flight.outcome for flight in flights.values()} == {Outcome.TIMEOUT}
+
+
+def test_flights_of_nested_diagrams_need_different_names(post_world):
+    builder = DiagramBuilder()
+    for name in "ab":
+        diagram = BuildFlightDiagram(Scenario(timeout=0.5), post_world, camera=False)
+        builder.AddNamedSystem(name, diagram)
+    with pytest.raises(ValueError, match="names of FlightMonitors must be different"):
+        fly_all(builder.Build())
+
+
+def test_a_policy_keeps_its_configuration(post_world):
+    scenario = Scenario(timeout=0.5, policy=policy_named("straight", 1.0))
+    diagram = BuildFlightDiagram(scenario, post_world, camera=False)
+    scenario.policy.speed = 3.0
+    assert np.linalg.norm(fly(diagram).states[:, 3:6], axis=1).max() < 1.1
 
 
 def test_flight_and_world_are_short_in_notebooks(post_world):

@@ -9,7 +9,12 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import CameraInfo
 
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
-from splatpilot.systems.collision.shapes import AnalyticDistanceField, HalfSpace, MovingSpheres
+from splatpilot.systems.collision.shapes import (
+    AnalyticDistanceField,
+    FieldWithSpheres,
+    HalfSpace,
+    MovingSpheres,
+)
 from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.moving_bodies import Bodies, MovingBodies, MovingObstacles, Track
 from splatpilot.systems.splats.splat_camera import SplatCamera
@@ -96,6 +101,10 @@ def test_poses_are_remembered_and_predicted():
     for time in (0.6, 1.333, 2.513, 3.7):
         np.testing.assert_allclose(bodies.centers(time), [[2.0 * time, 0.0, time]], atol=1e-9)
     np.testing.assert_array_equal(bodies.centers(-1.0), bodies.centers(0.0))
+    for time in 0.1 * np.arange(1, 13) + 2.6:  # close to the times of samples, which are rounded
+        simulator.AdvanceTo(time)
+        bodies = moving.GetOutputPort("moving").Eval(context)
+        np.testing.assert_allclose(bodies.centers(5.0), [[10.0, 0.0, 5.0]], atol=1e-6)
 
 
 def test_obstacles_and_bodies_are_together():
@@ -109,6 +118,8 @@ def test_obstacles_and_bodies_are_together():
     times = np.array([0.0, 1.0])
     distances = bodies.along(FIELD, times).distance(np.zeros((1, 2, 3)))
     np.testing.assert_allclose(distances, [[0.7, 0.7]])
+    seen = FieldWithSpheres(FIELD, np.zeros((1, 3)), np.zeros(1))  # a radius of 0 is none
+    np.testing.assert_array_equal(seen.distance(np.ones(3)), FIELD.distance(np.ones(3)))
 
 
 def test_invalid_bodies_are_refused():

@@ -188,6 +188,19 @@ def test_the_disturbance_estimate_removes_the_error_of_the_hover_thrust(time):
     assert states[-1, 2] == pytest.approx(2.0 - sag, abs=1e-3)
 
 
+def test_the_disturbance_estimate_begins_at_the_velocity_of_the_start():
+    config = FlatnessControllerConfig(disturbance_time=0.4)
+    controller = FlatnessController(config, QuadrotorParams())
+    context = controller.CreateDefaultContext()
+    state = hover_state([0.0, 0.0, 2.0])
+    state[3] = 4.0
+    controller.GetInputPort("state").FixValue(context, state)
+    controller.GetInputPort("acceleration").FixValue(context, np.zeros(3))
+    simulator = Simulator(controller, context)
+    simulator.Initialize()
+    np.testing.assert_allclose(context.get_discrete_state(1).value(), [4.0, 0, 0, 0, 0, 0])
+
+
 def test_the_disturbance_estimate_does_not_wind_up_while_thrust_saturates():
     flights = [
         fly(

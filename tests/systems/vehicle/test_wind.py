@@ -96,3 +96,10 @@ def test_numbers_are_parameters_of_the_context():
         value = converted.get_output_port().Eval(converted.CreateDefaultContext())[0]
         number = float(value.Evaluate()) if isinstance(value, Expression) else value.value()
         assert number == pytest.approx(gusts[0])
+    context = source.CreateDefaultContext()
+    after = source.EvalUniquePeriodicDiscreteUpdate(context).value()
+    for converted in (source.ToAutoDiffXd(), source.ToSymbolic()):
+        found = converted.EvalUniquePeriodicDiscreteUpdate(converted.CreateDefaultContext())
+        number = found.value()[0]
+        number = float(number.Evaluate()) if isinstance(number, Expression) else number.value()
+        assert number == pytest.approx(after[0])

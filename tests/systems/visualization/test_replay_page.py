@@ -18,11 +18,13 @@ from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.visualization.flight_visualizer import hypothesis_colors
 from splatpilot.systems.visualization.meshcat_drawing import draw_vehicle
 from splatpilot.systems.visualization.pages import (
     Frames,
     ReplayedFlight,
     ReplayView,
+    jpeg,
     pack_gaussians,
     replay_page,
 )
@@ -63,7 +65,7 @@ def straight(name: str, outcome: str, y: float = 0.0, roll: float = 0.0) -> Repl
     ]
     vectors = np.array([plan.to_vector() for plan in plans])
     shades = [np.full((48, 64, 3), 30 * k, np.uint8) for k in range(8)]
-    frames = Frames(0.5, shades, [255 - shade for shade in shades])
+    frames = Frames(0.5, list(map(jpeg, shades)), [jpeg(255 - shade) for shade in shades])
     return ReplayedFlight(name, outcome, times, states, 1 - times / 4, vectors, frames)
 
 
@@ -117,6 +119,17 @@ def test_page_shows_what_the_camera_sees(open_page, background):
     page.run("() => { replay.splats.mesh.visible = false; viewer.set_dirty(); }")
     assert psnr(page.picture(), truth) < 20
     assert page.errors == []
+
+
+def test_infinite_costs_and_clearances_are_shown(open_page):
+    flight = straight("a", "goal")
+    flight.hypotheses[:, -1], flight.clearances[3] = np.inf, np.inf
+    page = open_page(cloud(np.random.default_rng(1)), [flight])
+    page.run("() => replay.seek(2)")
+    assert page.errors == []
+    assert page.run("() => viewer.camera.far") == 1000
+    colors = hypothesis_colors(np.array([1.0, 2.0, np.inf]))
+    np.testing.assert_allclose(colors, [[0, 1, 0.1], [1, 0, 0.1], [1, 0, 0.1]])
 
 
 def test_controls_move_time_and_view_and_playback_changes_speed_and_loops(open_page):

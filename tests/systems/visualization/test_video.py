@@ -68,6 +68,11 @@ def test_video_holds_every_frame_in_order(recorder_after_one_second, tmp_path):
         np.testing.assert_allclose(right, colorize_depth(np.ones((1, 1)), 20.0)[0, 0], atol=5)
 
 
+def test_frames_may_be_read_again_before_they_end(recorder_after_one_second):
+    next(recorder_after_one_second.frames(20.0))
+    assert len(list(recorder_after_one_second.frames(20.0))) == 10
+
+
 def test_depth_colors_fade_with_distance():
     picture = colorize_depth(np.array([[0.0, 0.5, 2.0, 8.0, 65.535]]), max_depth=20.0)
     brightness = picture[0].astype(int).sum(axis=1)
