@@ -90,8 +90,8 @@ def fly_all(
         ) from None
     with client:
         for worker, found in client.run(program).items():
-            remedy = "install the same version there"
-            require(found == program(), f"program of worker {worker}", program(), found, remedy)
+            what, remedy = f"program of worker {worker}", "install the same version there"
+            require(found == program(), what, f"{program()}", found, remedy)
         futures = client.map(fly, list(work), pure=False, retries=3)
         try:
             for _, rollouts in distributed.as_completed(futures, with_results=True):

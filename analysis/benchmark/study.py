@@ -214,11 +214,8 @@ def own_speeds(config: StudyConfig) -> list[float]:
         return []
     files = {scenario_file(variant.scenario) for variant in config.scenario_variants}
     speeds = [policy_speed(load_config(Scenario(), file).policy) for file in files]
-    return (
-        speeds[:1]
-        if isinstance(speeds[0], float) and speeds.count(speeds[0]) == len(speeds)
-        else []
-    )
+    is_one = speeds.count(speeds[0]) == len(speeds)
+    return [speed for speed in speeds[:1] if isinstance(speed, float) and is_one]
 
 
 def _check_override(override: str, where: str) -> None:

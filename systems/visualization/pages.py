@@ -121,7 +121,7 @@ def compressed(data: bytes) -> str:
 def rounded(values: NDArray[np.floating]) -> list:
     """Rounds numbers to 0.1 mm, as nested lists; None stands for those that are not finite."""
     numbers = np.round(values, 4)
-    return np.where(np.isfinite(numbers), numbers, None).tolist()
+    return np.where(np.isfinite(numbers), numbers, np.array(None)).tolist()
 
 
 def jpeg(image: NDArray[np.uint8]) -> str:

@@ -59,7 +59,7 @@ def test_a_frame_keeps_its_number_until_the_next_comes():
     assert numbers == [CYCLE + k for k in (0, 0, 0, 1, 1, 2)]
     assert FrameTimes.late(0.1).number(1.0) is None
     slow = FrameTimes.draw(ObservationNoise(latency=0.5, frame_rate=[200.0, 200.0]), 1)
-    assert slow.number(0.0) >= 0
+    assert (slow.number(0.0) or -1) > 0
 
 
 @pytest.mark.parametrize("delay", [(0.0, 0.08), (0.03, 0.03), (0.09, 0.09)])
