@@ -1,7 +1,9 @@
 # Images for the CPU, and with --target cuda for NVIDIA GPUs:
 #
 #     docker build --tag splatpilot .
-#     docker run --rm --volume "$PWD/out:/home/pilot/out" splatpilot fly --out out/fly
+#     mkdir --parents out
+#     docker run --rm --user "$(id -u):$(id -g)" --env HOME=/tmp --volume "$PWD/out:/home/pilot/out" splatpilot \
+#         fly --out out/fly
 # hadolint global ignore=DL3008
 FROM python:3.12-slim-bookworm AS wheel
 RUN apt-get update \

@@ -56,7 +56,7 @@ class Command:
         words, self._patterns = COMMANDS[name]
         self._words, self._folder = words.split(), folder
         self._context = multiprocessing.get_context("forkserver")
-        modules = "commands.main", "benchmark.run_study", "reconstruction.run"
+        modules = "commands.main", "benchmark.run_study", "reconstruction.measure_scene"
         self._context.set_forkserver_preload([f"splatpilot.analysis.{name}" for name in modules])
         write_room_capture(folder / "room")
         (folder / "short.yaml").write_text(SCENARIO)

@@ -109,9 +109,9 @@ def test_benchmarks(run, tmp_path):
 
 EXTRAS = {
     "reconstruct . --out scene": ("torch", "train"),
-    "scene measure .": ("torch", "train"),
+    "scene measure small_house": ("torch", "train"),
     "scene ablate .": ("torch", "train"),
-    "scene fidelity .": ("torch", "train"),
+    "scene fidelity small_house": ("torch", "train"),
     "train diffaero --out trained": ("torch", "train"),
     "capture check photographs": ("pycolmap", "photos"),
 }

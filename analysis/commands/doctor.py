@@ -16,10 +16,12 @@ from splatpilot.systems.common.files import (
     DATA,
     SCENES,
     data_folder,
+    require_writable_folder,
     scenes_folder,
     write_text,
 )
 from splatpilot.systems.common.processes import available_cores
+from splatpilot.systems.common.readers import error_summary
 
 _DRIVER = Path("/proc/driver/nvidia")
 
@@ -76,6 +78,8 @@ def headlines(options: argparse.Namespace) -> dict[str, Any]:
     cli.announce("measuring speeds for about two minutes; with a GPU, up to twelve more")
     from splatpilot.analysis.headlines import run
 
+    if options.out is not None:
+        require_writable_folder(options.out.absolute().parent)
     result = run()
     if options.out is not None:
         write_text(options.out, result["table"])
@@ -112,6 +116,9 @@ def _gpu() -> list[Finding]:
         import torch
     except ModuleNotFoundError:
         return []  # The finding of the extra "train" comes first.
+    except (ImportError, OSError) as error:
+        found = f"PyTorch does not load: {error_summary(error)}"
+        return [Finding("GPU", found, "install PyTorch again", serves)]
     if not torch.cuda.is_available():
         if not _DRIVER.exists():
             return [Finding("GPU", "no driver", "an NVIDIA GPU and its driver", serves)]

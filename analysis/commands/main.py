@@ -46,7 +46,8 @@ class _ImportModule(argparse.Action):
     ) -> None:
         from splatpilot.systems.common.registry import import_modules
 
-        import_modules([value])
+        with contextlib.redirect_stdout(sys.stderr):  # Standard output may be JSON.
+            import_modules([value])
 
 
 class _Parser(argparse.ArgumentParser):

@@ -44,6 +44,7 @@ from splatpilot.systems.common.files import (
     locks_folder,
     require_unused,
     require_writable_folder,
+    write_text,
     written_atomically,
 )
 from splatpilot.systems.common.progress import Progress
@@ -183,8 +184,7 @@ def run(
         if recording is not None:
             stack.callback(cast(RerunSink, diagram.GetSubsystemByName("rerun")).close)
         if graphviz is not None:
-            with written_atomically(graphviz) as path:
-                path.write_text(diagram.GetGraphvizString())
+            write_text(graphviz, diagram.GetGraphvizString())
         if meshcat is None:
             return _fly_and_write(scenario, world, diagram, out, video)
         running_page(meshcat, scenario, world).save(out / "live.html")
@@ -230,8 +230,7 @@ def _fly_and_write(
         (out / name).unlink(missing_ok=True)
     write_flight(out, scenario, flight)
     if failure is not None:
-        with written_atomically(out / _TRACEBACK) as path:
-            path.write_text("".join(traceback.format_exception(failure)))
+        write_text(out / _TRACEBACK, "".join(traceback.format_exception(failure)))
     camera = cast(SplatCamera, diagram.GetSubsystemByName("camera"))
     summary = flight.summary() | {"render_ms": _render_ms(camera, flight)}
     write_summary(out, summary)

@@ -26,7 +26,7 @@ from splatpilot.diagrams.worlds.observed_routes import ObservedViews
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import dump_config
-from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.common.files import write_text, written_atomically
 from splatpilot.systems.common.provenance import MONTE_CARLO_SEEDS, InfeasibleFlightError
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -391,14 +391,12 @@ def write_flight(out: Path, scenario: Scenario, flight: Flight) -> None:
     """Writes the arrays of `Flight` to `trajectory.npz`, and `scenario.yaml`, into `out`."""
     with written_atomically(out / "trajectory.npz") as path:
         flight.save(path)
-    with written_atomically(out / "scenario.yaml") as path:
-        path.write_text(dump_config(scenario))
+    write_text(out / "scenario.yaml", dump_config(scenario))
 
 
 def write_summary(out: Path, summary: dict[str, float | str]) -> None:
     """Writes `summary.json` into the folder `out`."""
-    with written_atomically(out / "summary.json") as path:
-        path.write_text(json.dumps(summary, indent=2) + "\n")
+    write_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")
 
 
 def random_flights(

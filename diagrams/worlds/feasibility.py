@@ -123,12 +123,13 @@ def choose_start_and_goal(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
-    They are the ends of (nearly) the longest of all shortest paths, `min_length` to `longest` [m],
-    of a sphere of `radius` through known free space, with `margin` [m] to spare or half of that.
-    Given a seed, they are drawn: the start from the same part of free space, the goal from the
-    nodes whose shortest path is at least 60 % of that. After `_DRAWS` starts without such a goal,
-    the start is an end of the longest path.
+    They are the ends of (nearly) the longest of all shortest paths, `min_length` to `longest` or
+    1.5 `min_length` [m], of a sphere of `radius` through known free space, with `margin` [m] to
+    spare or half of that. Given a seed, they are drawn: the start from the same part of free
+    space, the goal from the nodes whose shortest path is at least 60 % of that. After `_DRAWS`
+    starts without such a goal, the start is an end of the longest path.
     """
+    longest = max(longest, 1.5 * min_length)
     part = longest_part(esdf, radius, margin, longest, min_length)
     if seed is None:
         goal, length = _farthest(part.graph, part.end, longest)

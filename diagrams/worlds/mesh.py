@@ -48,10 +48,12 @@ _VOXEL, _MAX_VOXELS = 0.1, 2e7  # [m], and number of suitable voxels
 _NEAREST = 9728
 _WRAPS = {33071: "clamp", 33648: "mirror"}
 # Required extensions that cannot be read, with a remedy each.
-_COMPRESSED = {
+_UNREAD = {
     "EXT_meshopt_compression": "decompress it with `gltf-transform copy IN.glb OUT.glb`",
     "KHR_meshopt_compression": "decompress it with `gltf-transform copy IN.glb OUT.glb`",
     "KHR_draco_mesh_compression": "decompress it with `gltf-transform copy IN.glb OUT.glb`",
+    "EXT_mesh_gpu_instancing": "write them out with `gltf-transform uninstance IN.glb OUT.glb`",
+    "KHR_mesh_quantization": "convert it with `gltf-transform dequantize IN.glb OUT.glb`",
     "KHR_texture_basisu": "convert its textures with `gltf-transform png IN.glb OUT.glb`",
 }
 # R_WM, of the axes of a file M by the one that points up.
@@ -72,7 +74,7 @@ def check_mesh(mesh: Path, up: str) -> None:
     if mesh.suffix.lower() != ".obj":
         with readable(mesh, "mesh"):
             required = _description(mesh.read_bytes()).get("extensionsRequired", [])
-        for extension, remedy in _COMPRESSED.items():
+        for extension, remedy in _UNREAD.items():
             what, condition = f"{mesh}: extensionsRequired", f"without {extension}"
             require(extension not in required, what, condition, required, remedy)
 
@@ -446,10 +448,11 @@ def _cut_material(
     pixels[..., :3] **= GAMMA
     pixels *= np.asarray(_base_color(material), dtype=np.float32)
     pixels[..., :3] *= pixels[..., 3:]
-    sampler = document.get("samplers", [{}])[document["textures"][info["index"]].get("sampler", 0)]
+    texture = document["textures"][info["index"]]
+    sampler = document["samplers"][texture["sampler"]] if "sampler" in texture else {}
     transform = info.get("extensions", {}).get("KHR_texture_transform", {})
     cos, sin = np.cos(transform.get("rotation", 0.0)), np.sin(transform.get("rotation", 0.0))
-    linear = np.array([[cos, -sin], [sin, cos]]) * transform.get("scale", [1.0, 1.0])
+    linear = np.array([[cos, sin], [-sin, cos]]) * transform.get("scale", [1.0, 1.0])
     return CutMaterial(
         pixels.astype(np.float32),
         np.column_stack([linear, transform.get("offset", [0.0, 0.0])]),

@@ -16,7 +16,7 @@ from splatpilot.diagrams.worlds.solids.textures import Illumination, shade
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
 from splatpilot.systems.collision.shapes import HalfSpace
-from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.common.files import write_text
 from splatpilot.systems.splats.scene import GaussianScene
 
 Array = NDArray[np.floating]
@@ -60,8 +60,7 @@ def write_gltf(spec: WorldSpec, path: Path, texel: float = 0.02) -> None:
     meshes = _solid_meshes(spec, light, texel)
     if surroundings := spec.surroundings():
         meshes.append(_diamonds(merge(surroundings)))
-    with written_atomically(path) as temporary:
-        temporary.write_text(json.dumps(_document(meshes)))
+    write_text(path, json.dumps(_document(meshes)))
 
 
 def _document(meshes: list[_Mesh]) -> dict[str, Any]:

@@ -128,6 +128,7 @@ def parse_config[Configuration](
     """
     with yaml_errors(source):
         given = yaml_load_data(text, private=True)
+        require_distinct_keys(yaml.compose(text, _LOADER))
         try:
             drawn, start = {}, tuple(filter(None, prefix.split(".")))
             if dataclasses.is_dataclass(defaults):  # Drake's types take the distributions they can
@@ -274,6 +275,26 @@ def _check_names(config: Any, given: Any, prefix: str, kinds: Sequence[Any] = ()
         _check_names(held, value, f"{prefix}{name}.", _tagged_types(known[name]))
 
 
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast
+
+
+def require_distinct_keys(node: Any) -> None:
+    """Raises ValueError for a key that is given twice in a mapping of YAML, at any depth."""
+    parts, seen = [node], set[int]()
+    while parts:
+        part = parts.pop()
+        if id(part) in seen or not isinstance(part, yaml.CollectionNode):
+            continue
+        seen.add(id(part))
+        if isinstance(part, yaml.MappingNode):
+            keys = [key.value for key, _ in part.value if isinstance(key, yaml.ScalarNode)]
+            repeated = [name for k, name in enumerate(keys) if name in keys[:k]]
+            require(not repeated, "fields", "given once", ", ".join(repeated))
+            parts += [value for _, value in part.value]
+        else:
+            parts += part.value
+
+
 def _tagged_types(expected: Any) -> list[Any]:
     """Returns the types that tags of a field, or of the items of its dictionary, may name."""
     options = get_args(get_args(expected)[1] if get_origin(expected) is dict else expected)
@@ -318,6 +339,8 @@ def _check_type(name: str, expected: Any, value: Any) -> None:
     if get_origin(expected) is list and isinstance(value, list):
         for index, each in enumerate(value):
             _check_type(f"{name}[{index}]", options[0], each)
+    elif get_origin(expected) is list:  # Drake's reader takes the keys of mappings.
+        require(not isinstance(value, dict), name, "a list", _shortened(value))
     elif get_origin(expected) is UnionType and len(options) == 1:
         _check_type(name, options[0], value)
     elif expected in TYPES:

@@ -29,7 +29,8 @@ SHIPPED_SCENES = Path(__file__).parents[2] / "scenes"
 """The folder of the scenes of this package."""
 
 _HOST = re.sub(r"[^\w-]", "-", platform.node()) or "host"
-_LEFTOVER = re.compile(rf"\..+\.{re.escape(_HOST)}\.(\d+)\.partial(\..*)?")
+_LEFTOVER = re.compile(rf"\.(?P<name>.+)\.{re.escape(_HOST)}\.(?P<pid>\d+)\.partial(\..*)?")
+_REPLACED = ".replaced"
 _DISK_FULL = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: libraries without a number
 
 
@@ -83,7 +84,8 @@ def folder_written_atomically(path: Path, *, replace: bool = False) -> Iterator[
     Args:
         replace: replaces a folder at `path`, which otherwise stays.
     """
-    partial, replaced = _temporary(path, path.name), _temporary(path, path.name, ".replaced")
+    path = path.resolve()  # of a link, what it names
+    partial, replaced = _temporary(path, path.name), _temporary(path, path.name, _REPLACED)
     shutil.rmtree(partial, ignore_errors=True)
     try:
         with _naming(path, partial):
@@ -93,19 +95,27 @@ def folder_written_atomically(path: Path, *, replace: bool = False) -> Iterator[
                 _flush(file)
             if replace and path.is_dir():
                 path.rename(replaced)
-            _rename_unless_taken(partial, path)
+                partial.rename(path)
+            else:
+                _rename_unless_taken(partial, path)
     finally:
+        if replaced.exists() and not path.exists():
+            replaced.rename(path)
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(replaced, ignore_errors=True)
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Removes the temporary files of processes of this host that have ended."""
+    """Removes the temporary files of processes of this host that have ended; what they were about
+    to replace returns."""
     for path in folder.iterdir():
         match = _LEFTOVER.fullmatch(path.name)
-        if match is None or _is_running(int(match[1])):
+        if match is None or _is_running(int(match["pid"])):
             continue
-        if path.is_dir():
+        target = path.with_name(match["name"])
+        if path.name.endswith(_REPLACED) and not target.exists():
+            path.rename(target)
+        elif path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)

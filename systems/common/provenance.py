@@ -47,8 +47,9 @@ def revision() -> str:
     checkout = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str:
+        command = ["git", "-c", f"safe.directory={checkout}", *arguments]  # of any owner
         return subprocess.run(
-            ["git", *arguments], cwd=checkout, check=True, capture_output=True, text=True
+            command, cwd=checkout, check=True, capture_output=True, text=True
         ).stdout
 
     try:

@@ -155,7 +155,8 @@ def time_of_arrival(
     goal_slowness = float(slowness(goal_distance))
     x, y, z = (c - g for c, g in zip(field.voxel_centers(), p_WG, strict=True))
     to_goal = np.sqrt((x**2)[:, None, None] + (y**2)[:, None] + z**2)  # (nx, ny, nz) [m]
-    sphere = to_goal <= start
+    # Not beyond the free space around the goal: there may be another room.
+    sphere = to_goal <= min(start, max(float(goal_distance), to_goal.min()))
     speed = np.where(sphere, 1.0 / goal_slowness, 1.0 / slowness(field.distances))
     blocked = (field.distances < VEHICLE_RADIUS + margin) & ~sphere
     marched = np.empty(speed.shape)

@@ -18,7 +18,7 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import MovingSpheres
-from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.common.files import write_text
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.hypotheses import Hypotheses, num_hypotheses_in
 from splatpilot.systems.splats.background import Background, EnvironmentMap
@@ -109,8 +109,7 @@ class HtmlPage:
 
     def save(self, path: Path) -> None:
         """Writes the page atomically."""
-        with written_atomically(path) as partial:
-            partial.write_text(self.html)
+        write_text(path, self.html)
 
 
 def compressed(data: bytes) -> str:

@@ -83,15 +83,6 @@ def test_own_policy_flies_by_its_configuration_and_by_an_unregistered_entry(
     assert re.search(r"sidestep +2 +1/1", out) and re.search(r"mine +2 +1/1", out)
 
 
-def test_monte_carlo(run, tmp_path):
-    (tmp_path / "short.yaml").write_text(SHORT)
-    words = ["--scenarios", "short.yaml", "--seeds", 1, "--jobs", 1]
-    out = run("monte_carlo.py", *words)
-    summary = out[out.index("policy   observation") :]
-    assert re.findall(r"(clean|noisy) +1 ", summary) == ["clean", "noisy"] * 2
-    assert "of 2 flights arrive without noise" in out
-
-
 def test_lqr_hover(run):
     out = run("lqr_hover.py")
     assert number(r"from (\S+) s on", out) < 5

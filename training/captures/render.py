@@ -2,8 +2,9 @@
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from splatpilot.diagrams.worlds.world_registry import WorldConfig, is_procedural
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.common.config import dump_config, load_config
+from splatpilot.systems.common.distributions import sample_distributions
 from splatpilot.systems.common.files import (
     locked_folder,
     require_writable_folder,
@@ -135,7 +137,8 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
             )
         spec = make_spec(scenario.world, seed)
         recipe = RenderedWorld("world.gltf", f"{world.name}, seed {seed}", config, version=_VERSION)
-        described = f"{type(scenario.world).__name__} {seed}\n{dump_config(scenario.world)}"
+        shown = _shown(scenario.world, seed)
+        described = f"{type(shown).__name__} {seed}\n{dump_config(shown)}"
         digests, found = part_digests([described.encode()]), _generated_split(scenario.world, seed)
     else:
         check_mesh(world, config.up)
@@ -223,11 +226,20 @@ def rendered_world(capture: Path) -> RenderedWorld | None:
 def _generated_split(world: WorldConfig, seed: int) -> str:
     """Returns the split of a generated world: that of its seed if the benchmark flies in it."""
     worlds = [load_config(Scenario(), file).world for file in benchmark_scenarios().values()]
-    if world not in worlds:
+    if _shown(world, seed) not in [_shown(each, seed) for each in worlds]:
         return "train"
     if seed < TRAINING_SEEDS:
         return "test"
     return "train" if seed < VALIDATION_SEEDS else "validation"
+
+
+def _shown(world: WorldConfig, seed: int) -> Any:
+    """Returns the configuration of a world without distributions, and without what images do not
+    show."""
+    drawn = sample_distributions(world, seed, ("world",))
+    if not hasattr(drawn, "voxel_size"):
+        return drawn
+    return replace(drawn, voxel_size=type(drawn)().voxel_size)  # pyright: ignore
 
 
 def _poses_on_path(esdf: Esdf, config: RenderConfig) -> list[RigidTransform]:

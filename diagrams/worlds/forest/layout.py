@@ -168,6 +168,7 @@ def lay_out(
     gap = np.linalg.norm(base[:, None] - clear, axis=-1)
     open_ = (gap > blocked[:, None]).all(axis=1)
     trees = Trees(*(getattr(trees, name)[open_] for name in Trees.__dataclass_fields__))
+    require(len(trees.base), "density", "that of one trunk or more", config.density, "raise it")
 
     # Rocks and logs: apart from everything else, and below the flight height.
     taken = [*np.column_stack([trees.base, trees.radius]), *([*p, clearance] for p in clear)]

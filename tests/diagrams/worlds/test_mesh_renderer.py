@@ -161,6 +161,24 @@ def test_a_rolling_shutter_of_a_still_camera_changes_nothing(opengl, scene):
         np.testing.assert_allclose(one, other[10:30], atol=1.1 / 255)
 
 
+def test_holes_turn_with_the_texture(opengl, changed):
+    def turn(document):
+        info = document["materials"][1]["pbrMetallicRoughness"]["baseColorTexture"]
+        transform = {"rotation": np.pi / 2, "offset": [0.0, 1.0], "scale": [1.0, 1.0]}
+        info["extensions"] = {"KHR_texture_transform": transform}
+
+    bright = np.repeat(HALVES[..., None], 3, axis=2).astype(np.uint8)
+    stream = BytesIO()
+    Image.fromarray(bright).save(stream, "PNG")
+    opaque = data_uri("image/png", stream.getvalue())
+    white = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}
+    shown = view(changed(turn, dict(white), opaque)).color[..., 1] > 100
+    solid = np.abs(view(changed(turn, dict(MASKED), png(HALVES))).depth - QUAD) < 0.01
+    inside = (slice(9, 15), slice(13, 19))  # of the quad
+    assert 0.2 < shown[inside].mean() < 0.8
+    assert (shown[inside] == solid[inside]).mean() > 0.9
+
+
 @pytest.mark.parametrize("uri", ["grün weiß.png", "gr%C3%BCn%20wei%C3%9F.png"])
 def test_names_of_images_and_buffers_may_be_escaped(opengl, changed, tmp_path, uri):
     Image.new("RGB", (4, 4), "white").save(tmp_path / "grün weiß.png")
@@ -210,6 +228,10 @@ def test_white_that_faces_up_is_not_clipped(opengl, changed):
         (
             lambda document: [node.update(scale=[0.01] * 3) for node in document["nodes"]],
             "the longest side must be in .* set scale=1000 if it is in kilometers",
+        ),
+        (
+            lambda document: document.update(extensionsRequired=["KHR_mesh_quantization"]),
+            "without KHR_mesh_quantization, got .*gltf-transform dequantize",
         ),
         (
             lambda document: document.update(extensionsRequired=["EXT_meshopt_compression"]),

@@ -93,6 +93,14 @@ def test_missing_and_empty_files_are_named(tmp_path):
             load_config(Scenario(), path)
 
 
+def test_keys_given_twice_and_mappings_for_lists_are_refused():
+    for text in ("timeout: 20\ntimeout: 30", "world: {length: 20}\nseed: 1\nworld: {width: 9}"):
+        with pytest.raises(ValueError, match=r"fields must be given once, got (timeout|world)"):
+            parse_config(Scenario(), text, "f.yaml")
+    with pytest.raises(ValueError, match=r"start must be a list, got \{0: 1"):
+        parse_config(Scenario(), "start: {0: 1, 1: 2, 2: 3}", "f.yaml")
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

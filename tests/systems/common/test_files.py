@@ -8,6 +8,7 @@ import pytest
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import (
+    _HOST,
     DATA,
     claim_folder,
     find_data,
@@ -74,6 +75,38 @@ def test_folder_appears_when_the_block_ends(tmp_path):
     with folder_written_atomically(path, replace=True) as partial:
         (partial / "other").write_text("newer")
     assert list(path.iterdir()) == [path / "other"] and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(errno.EIO, "input/output error")])
+def test_a_folder_is_kept_if_its_replacement_fails(tmp_path, monkeypatch, error):
+    path = tmp_path / "scene"
+    (path / "old").mkdir(parents=True)
+    rename = Path.rename
+
+    def fail(self, target):
+        if self.name.endswith(".partial"):
+            raise error
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", fail)
+    with pytest.raises((KeyboardInterrupt, OSError)), folder_written_atomically(path, replace=True):
+        pass
+    assert list(path.iterdir()) == [path / "old"] and list(tmp_path.iterdir()) == [path]
+    # A process that was killed between both renames.
+    ended = f".scene.{_HOST}.{2**31 - 1}.partial"
+    path.rename(tmp_path / f"{ended}.replaced")
+    (tmp_path / ended).mkdir()
+    require_writable_folder(tmp_path)
+    assert list(path.iterdir()) == [path / "old"] and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_to_a_folder_stays_a_link(tmp_path):
+    (tmp_path / "disk/scene").mkdir(parents=True)
+    (tmp_path / "scene").symlink_to(tmp_path / "disk/scene")
+    with folder_written_atomically(tmp_path / "scene", replace=True) as folder:
+        (folder / "new").touch()
+    assert (tmp_path / "scene").is_symlink() and (tmp_path / "disk/scene/new").exists()
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_leftovers_of_ended_processes_are_removed(tmp_path):

@@ -2,9 +2,12 @@ import copy
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
 
 from splatpilot import _native
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box
 from splatpilot.systems.policies.time_of_arrival import slowness, time_of_arrival
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
@@ -121,3 +124,12 @@ def test_bad_goals_are_refused(pillar, p_WG, message):
     unknown = Esdf(pillar.distances, pillar.states, pillar.lower_W, pillar.voxel_size)
     with pytest.raises(ValueError, match=r"pass esdf.conservative\(\)"):
         time_of_arrival(unknown, np.full(3, 0.9))
+
+
+def test_a_goal_near_a_thin_wall_is_not_reached_through_it():
+    lower, upper = np.zeros(3), np.array([12.0, 6.4, 4.0])
+    wall = Box(RigidTransform([6.0, 3.2, 2.0]), np.array([0.1, 10.0, 10.0]))
+    esdf = esdf_from_distance_field(AnalyticDistanceField([wall], lower, upper), 0.8).conservative()
+    for x in np.linspace(6.46, 6.9, 12):
+        toa = time_of_arrival(esdf, np.array([x, 3.2, 2.0]), margin=0.0)
+        assert not toa.is_reachable(np.array([2.0, 3.2, 2.0]))

@@ -115,6 +115,11 @@ def test_generated_world_has_its_shapes_and_the_split_of_its_seed(
     scenario = tmp_path / "room.yaml"
     scenario.write_text("world: !RoomConfig {length: 6, width: 4, height: 2.6, items: 1}\n")
     monkeypatch.setattr(render_capture, "benchmark_scenarios", lambda: {"P13": scenario})
+    # A grid of another size shows the same.
+    finer = tmp_path / "finer.yaml"
+    finer.write_text(scenario.read_text().replace("items: 1", "items: 1, voxel_size: 0.07"))
+    world = load_config(Scenario(), finer).world
+    assert render_capture._generated_split(world, seed) == split
     config = RenderConfig(width=64, height=48, path=[[1.5, 0.4, 1.5]], yaws=[0.0, 120.0])
     run(world="P13", out=tmp_path / "capture", config=config, seed=seed)
     recipe = rendered_world(tmp_path / "capture")

@@ -183,7 +183,7 @@ def three_gaussians(scales=(0.005, 0.5, 0.005), opacities=(0.9, 0.9, 0.9)) -> Sp
 
 def strategy_for(splats: SplatParameters, **changes) -> DefaultStrategy:
     fields = {"strategy": "default", "iterations": 100, "refine_start": 1, "refine_every": 1}
-    fields |= {"reset_every": 0, "refine_fraction": 1.0}
+    fields |= {"reset_every": 0, "refine_fraction": 1.0, "max_gaussians": 100}
     return DefaultStrategy(ReconstructConfig(**fields | changes), torch.zeros(3), 1.0, len(splats))
 
 

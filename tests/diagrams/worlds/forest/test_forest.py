@@ -123,6 +123,7 @@ def test_forests_have_a_tree_in_each_so_many_square_meters(area):
     "values, message",
     [
         ({"density": 0.2}, r"density must be at most \d+ trunks at this spacing, got \d+"),
+        ({"density": 1e-4}, r"density must be that of one trunk or more, got 0\.0001; raise it"),
         ({"voxel_size": 1e-4}, "a box of .* use larger voxels"),
         ({"width": 150.0, "length": 190.0}, r"length \* width must be at most 20000 m\^2"),
         ({"width": 2.0}, r"width must be at least 2.5.* got 2.0"),
