@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import inspect
 import re
+import reprlib
 import shutil
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
@@ -366,6 +367,8 @@ def _import_types(config: Any, text: str) -> None:
             known = {known.__name__ for known in field.registry.configs()}
             if set(re.findall(r"!(\w+)", text)) - known:
                 field.registry.load_announced()
+        else:
+            _import_types(getattr(config, field.name, None), text)
 
 
 def _unknown_tag(config: Any, tag: str, name: str) -> str:
@@ -382,7 +385,9 @@ def _shortened(value: Any) -> str:
     """Returns a value's text, shortened: it may be a whole file."""
     if isinstance(value, dict) and "_tag" in value:
         value = value["_tag"]
-    text = "null" if value is None else " ".join(str(value).split())
+    # Aliases of YAML may make a short file a huge value.
+    whole = reprlib.repr(value) if isinstance(value, dict | list) else str(value)
+    text = "null" if value is None else " ".join(whole.split())
     return text if len(text) <= 40 else f"{text[:40]}..."
 
 

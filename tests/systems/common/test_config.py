@@ -110,6 +110,7 @@ def test_keys_given_twice_and_mappings_for_lists_are_refused():
         (b"seed: \xff", "a.yaml must be a text .* 0xff at byte 6"),
         (b"start: " + b"[" * 5000 + b"]" * 5000, "a.yaml is not YAML: .* nested too deeply"),
         (b"start: &a [1, *a]", r"a.yaml: start\[1\] must be a number, got \[1"),
+        (b"moving: {a: &m {radius: !Uniform {min: 1, max: 2}}, b: *m}", r"without \*, got \*"),
         (b"", "a.yaml must have at most 64 MB, got 100 MB"),
     ],
 )
