@@ -355,7 +355,9 @@ class VectorFlightEnv(VectorEnv):
         ends[own] = _TERMINATED
         ended, terminated = ended | own, terminated | own
         self._previous[flying] = given[flying]
-        self._decisions[flying], self._ended = decided[flying], ended
+        self._ended = ended
+        if self.pool.is_delayed:
+            np.copyto(self._decisions, decided, where=flying[:, None])
         self._count += flying
         infos: dict[str, Any] = {}
         if ended.any():

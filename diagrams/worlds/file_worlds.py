@@ -1,7 +1,7 @@
 """Worlds from files: meshes, and OctoMaps, drawn as colored blocks."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -143,6 +143,17 @@ class MeshWorld(Config):
         require_field(self, "background", len(self.background) == 3, "red, green and blue")
 
 
+def _above_surfaces(esdf: Esdf) -> Esdf:
+    """Returns a field in which free space without any surface below, such as that under terrain, is
+    unknown, unless all is."""
+    free = esdf.states == FieldState.FREE
+    above = np.logical_or.accumulate(esdf.states == FieldState.OCCUPIED, axis=2)
+    if not (free & above).any():
+        return esdf
+    unknown = np.uint8(FieldState.UNKNOWN)
+    return replace(esdf, states=np.where(free & ~above, unknown, esdf.states))
+
+
 def mesh_world(config: MeshWorld, seed: int) -> World:
     """Reads the mesh of `config`."""
     # Trimesh takes a third of the time of all imports of a flight.
@@ -154,7 +165,7 @@ def mesh_world(config: MeshWorld, seed: int) -> World:
     check_mesh(path, config.up)
     esdf = mesh_distance(path, config.up, config.voxel_size, config.scale)
     drawn = {"min_length": config.min_path, "seed": seed} if config.draw_ends else {}
-    ends = choose_ends(esdf, config.path, **drawn)
+    ends = choose_ends(_above_surfaces(esdf), config.path, **drawn)
     points, normals, colors, area = sample_colors(path, config.up, config.scale, _PREVIEW)
     extent = np.full((len(points), 2), _GAP * COVERAGE * np.sqrt(area / len(points)))
     surfels = Surfels(points, normals, perpendicular(normals), extent)

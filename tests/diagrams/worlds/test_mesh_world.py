@@ -97,3 +97,16 @@ def test_textures_are_not_randomized(world):
 def test_bad_input_is_named(room, fields, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         make_world(MeshWorld(**{"path": str(room), "up": "z"} | fields), 0)
+
+
+def test_ends_lie_above_open_terrain(opengl, tmp_path):
+    x, y = (each.ravel() for each in np.meshgrid(*[np.linspace(-10.0, 10.0, 21)] * 2))
+    corners = np.column_stack([x, y, 4.0 * (1.0 - np.abs(y) / 10.0)])
+    first = (np.arange(20)[:, None] * 21 + np.arange(20)).ravel()
+    faces = np.concatenate([first[:, None] + [0, 1, 22], first[:, None] + [0, 22, 21]])
+    trimesh.Scene([trimesh.Trimesh(corners, faces)]).export(tmp_path / "ridge.glb")
+    fields = {"path": str(tmp_path / "ridge.glb"), "up": "z", "voxel_size": 0.25}
+    for seed in range(3):
+        world = make_world(MeshWorld(**fields, draw_ends=seed > 0), seed)
+        for end in (world.p_WS, world.p_WG):
+            assert end[2] > 4.0 * (1.0 - abs(end[1]) / 10.0)
