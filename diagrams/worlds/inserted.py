@@ -1,5 +1,6 @@
 """Reconstructed scenes with inserted obstacles."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,11 +100,14 @@ def _shape(config: InsertedConfig, p: NDArray, rng: np.random.Generator) -> Shap
     return Capsule(p - up, p + up, float(half.min()))
 
 
-def _surface(shape: Shape) -> NDArray:
-    """Samples points (N, 3) on a shape."""
-    s = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 9)]), axis=-1).reshape(-1, 2)
-    zero = np.zeros(3)
-    return np.concatenate([face.at(s * face.size)[0] for face in cut_faces(shape, zero, zero)])
+def _surface(shape: Shape, spacing: float = math.inf) -> NDArray:
+    """Samples points (N, 3) on a shape, 9 x 9 on a face, or more at most `spacing` [m] apart."""
+    points, zero = [], np.zeros(3)
+    for face in cut_faces(shape, zero, zero):
+        counts = [max(9, math.ceil(length / spacing) + 1) for length in face.size]
+        s = np.stack(np.meshgrid(*(np.linspace(0, 1, n) for n in counts)), axis=-1).reshape(-1, 2)
+        points.append(face.at(s * face.size)[0])
+    return np.concatenate(points)
 
 
 def _merge(esdf: Esdf, solids: list[Solid]) -> Esdf:
@@ -145,7 +149,8 @@ def _insert(world: World, solids: list[Solid], esdf: Esdf, seed: int) -> World:
     gaussians = draw(spec, solids, light).merged_with(world.gaussians)  # the frontier stays last
     observations = world.observations
     if observations is not None:
-        surfaces = np.concatenate([_surface(solid.shape) for solid in solids])
+        spacing = observations.voxel_size
+        surfaces = np.concatenate([_surface(solid.shape, spacing) for solid in solids])
         observations = observations.with_surfaces(surfaces)
     frontier = world.num_frontier
     return World(

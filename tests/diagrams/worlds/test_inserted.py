@@ -70,3 +70,13 @@ def test_inserted_solids_are_seen_hit_and_leave_gaps(hall, monkeypatch):
     assert connects(field, *ends, GAP / 2 - 0.05, 0.1)
     again = make_world(InsertedConfig(path="hall"), 0)
     np.testing.assert_array_equal(world.gaussians.means, again.gaussians.means)
+
+
+def test_inserted_solids_count_as_observed():
+    scene = make_world(SceneConfig(path="small_house"), 0)
+    world = make_world(InsertedConfig(path="small_house"), 0)
+    assert scene.observations is not None and world.observations is not None
+    assert len(world.observations.voxels) > len(scene.observations.voxels)
+    added = world.gaussians.means[: len(world.gaussians) - len(scene.gaussians)].astype(float)
+    above = added.mean(axis=0) + np.array([0.0, 0.0, 5.0])
+    assert world.observations.agree_with(added, above).mean() > 0.98
