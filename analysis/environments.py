@@ -285,7 +285,7 @@ def _store(scenes: Path, record: Record) -> None:
 def _source(entry: Entry, data: Path | None) -> Path | str:
     if entry.source in benchmark_scenarios():
         return entry.source
-    return (data or Path(f"${DATA}")) / entry.source
+    return (data or Path(f"${DATA}")) / entry.source  # without a folder, for messages
 
 
 def _make(

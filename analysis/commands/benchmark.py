@@ -163,10 +163,9 @@ def replay(options: argparse.Namespace) -> None:
 
     first, *others = options.ids
     if others:
-        given = "--meshcat", "--video", "--rerun"
-        kinds = [flag for flag in given if getattr(options, flag[2:])]
-        remedy = "name one flight"
-        require(not kinds, f"{len(options.ids)} flights", "without options", kinds[0:], remedy)
+        names = [name for name in ("meshcat", "video", "rerun") if getattr(options, name)]
+        found, remedy = ", ".join(f"--{name}" for name in names), "name one flight"
+        require(not names, f"{len(options.ids)} flights", "without options", found, remedy)
         cli.call(replay.overlay, options)
     elif not cli.call(replay.run, options, id=first):
         raise ValueError(f"{first}: the replay differs from the recorded flight")

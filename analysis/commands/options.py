@@ -251,7 +251,7 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
         scenario.policy = parse_variant(options.policy).config(DEFAULT_SPEED, scenario.policy)
     if options.speed is not None:
         scenario.policy = at_speed(scenario.policy, options.speed)
-    if options.scene is not None:
+    if options.scene is not None:  # not resolved yet if --set help follows
         scenario.world = scene_config(require_scene(str(options.scene)).absolute())
     if options.seed is not None:
         scenario.seed = options.seed

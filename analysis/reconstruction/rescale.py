@@ -178,13 +178,7 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
             depth = render_depth(capture, shrunk, gaussians, about.representation, threads)
             if not capture.has_depth:  # as `make_distance_field` does
                 depth = keep_confirmed(depth, 2.0 * field.voxel_size)
-                path = swept_space(
-                    *(capture.X_WCs, field.lower_W, field.states.shape, field.voxel_size),
-                    VEHICLE_RADIUS,
-                )
-                states = field.states.copy()
-                states[path & (states == FieldState.UNKNOWN)] = FieldState.FREE
-                field = replace(field, states=states)
+                field = _with_free_path(field, capture.X_WCs)
             field, frontier = scene_folder.close_frontier(
                 field, depth.images(), depth.K, depth.X_WCs
             )
@@ -207,6 +201,13 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
     details = {"shortest path [m]": f"{length:.1f}"} if math.isfinite(length) else {}
     size = field.upper_W - field.lower_W
     return RescaleSummary(out, factor, size, details, (*warnings, *unflyable))
+
+
+def _with_free_path(field: Esdf, X_WCs: Sequence[RigidTransform]) -> Esdf:
+    """Returns a field that is free where the camera, and so the vehicle, has been."""
+    grid = field.lower_W, field.states.shape, field.voxel_size
+    path = swept_space(X_WCs, *grid, VEHICLE_RADIUS) & (field.states == FieldState.UNKNOWN)
+    return replace(field, states=np.where(path, np.uint8(FieldState.FREE), field.states))
 
 
 def _about_capture(

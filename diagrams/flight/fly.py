@@ -75,8 +75,9 @@ def replayed_flight(name: str, flight: Flight, frames: Frames | None) -> Replaye
 
 def recorded_frames(recorder: VideoRecorder, scenario: Scenario) -> Frames:
     """Returns the images of the scenario's camera."""
-    frames = recorder.frames(scenario.camera.z_far)
-    color, depth = zip(*(map(jpeg, pictures) for pictures in frames), strict=True)
+    # One by one: raw images of a flight do not fit in memory.
+    pairs = [tuple(map(jpeg, pictures)) for pictures in recorder.frames(scenario.camera.z_far)]
+    color, depth = zip(*pairs, strict=True)
     return Frames(1 / scenario.camera.fps, color, depth, scenario.camera.z_far)
 
 

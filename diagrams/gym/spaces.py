@@ -213,9 +213,9 @@ def observe_image(name: str, image: NDArray[Any], max_depth: float) -> NDArray[A
     return proximity.astype(np.uint8)[..., None]
 
 
-# [-] Scale of actions at 1: thrust [m/s^2] and body rates [rad/s], [m/s^2], [m/s], [m].
+# [-] Scale of actions at 1: body rates [rad/s], for thrust that is g; [m/s^2], [m/s], [m].
 _LIMITS = {
-    "command": (GRAVITY, 6.0, 6.0, 2.0),
+    "command": (6.0, 6.0, 2.0),
     "acceleration": (6.0, 6.0, 6.0),
     "velocity": (3.0, 3.0, 3.0),
     "waypoint": (1.2, 1.2, 1.2),
@@ -357,10 +357,8 @@ class FlightEnvConfig(Config):
 
     def limits(self) -> NDArray[np.float64]:
         """Returns the scale (n,) of actions."""
-        limits = np.array(self.action_limits or _LIMITS[self.action])
-        if self.action == "command" and not self.action_limits:
-            limits[0] = self.gravity
-        return limits
+        thrust = (self.gravity,) if self.action == "command" else ()
+        return np.array(self.action_limits or (*thrust, *_LIMITS[self.action]))
 
     def terminates(self, transition: Transition) -> NDArray[np.bool_]:
         """Returns the flights (N,) that end by `terminate`."""

@@ -33,7 +33,12 @@ from splatpilot.systems.common.distributions import (
     is_distribution,
     take_distributions,
 )
-from splatpilot.systems.common.readers import error_summary, read_text, yaml_errors
+from splatpilot.systems.common.readers import (
+    error_summary,
+    read_text,
+    yaml_collections,
+    yaml_errors,
+)
 from splatpilot.systems.common.registry import Registry
 from splatpilot.systems.common.validation import TYPES, did_you_mean, require
 
@@ -129,7 +134,7 @@ def parse_config[Configuration](
     """
     with yaml_errors(source):
         given = yaml_load_data(text, private=True)
-        require_distinct_keys(yaml.compose(text, _LOADER))
+        _require_distinct_keys(text)
         try:
             drawn, start = {}, tuple(filter(None, prefix.split(".")))
             if dataclasses.is_dataclass(defaults):  # Drake's types take the distributions they can
@@ -269,31 +274,20 @@ def _check_names(config: Any, given: Any, prefix: str, kinds: Sequence[Any] = ()
             raise ValueError(f"there is no field {prefix}{name}; {hint}")
         if value is None and NoneType in get_args(known[name]):
             continue
-        held = getattr(config, name)
-        is_list = not (isinstance(held, list) and isinstance(value, str))  # list("abc") works
-        require(is_list, prefix + name, "a list", _shortened(value), f"write [{value}]")
         _check_type(f"{prefix}{name}", known[name], value)
-        _check_names(held, value, f"{prefix}{name}.", _tagged_types(known[name]))
+        _check_names(getattr(config, name), value, f"{prefix}{name}.", _tagged_types(known[name]))
 
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast
 
 
-def require_distinct_keys(node: Any) -> None:
+def _require_distinct_keys(text: str) -> None:
     """Raises ValueError for a key that is given twice in a mapping of YAML, at any depth."""
-    parts, seen = [node], set[int]()
-    while parts:
-        part = parts.pop()
-        if id(part) in seen or not isinstance(part, yaml.CollectionNode):
-            continue
-        seen.add(id(part))
-        if isinstance(part, yaml.MappingNode):
-            keys = [key.value for key, _ in part.value if isinstance(key, yaml.ScalarNode)]
+    for node, _ in yaml_collections(yaml.compose(text, _LOADER)):
+        if isinstance(node, yaml.MappingNode):
+            keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
             repeated = [name for k, name in enumerate(keys) if name in keys[:k]]
             require(not repeated, "fields", "given once", ", ".join(repeated))
-            parts += [value for _, value in part.value]
-        else:
-            parts += part.value
 
 
 def _tagged_types(expected: Any) -> list[Any]:
@@ -340,8 +334,9 @@ def _check_type(name: str, expected: Any, value: Any) -> None:
     if get_origin(expected) is list and isinstance(value, list):
         for index, each in enumerate(value):
             _check_type(f"{name}[{index}]", options[0], each)
-    elif get_origin(expected) is list:  # Drake's reader takes the keys of mappings.
-        require(not isinstance(value, dict), name, "a list", _shortened(value))
+    elif get_origin(expected) is list:  # Drake's reader takes letters of texts, and keys.
+        remedy = f"write [{value}]" if isinstance(value, str) else ""
+        require(not isinstance(value, str | dict), name, "a list", _shortened(value), remedy)
     elif get_origin(expected) is UnionType and len(options) == 1:
         _check_type(name, options[0], value)
     elif expected in TYPES:

@@ -30,6 +30,7 @@ from pydrake.common.schema import (
 )
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
+from splatpilot.systems.common.readers import yaml_collections
 from splatpilot.systems.common.validation import require
 
 FieldPath = tuple[str | int, ...]
@@ -249,15 +250,8 @@ def take_distributions(text: str, path: FieldPath = ()) -> tuple[str, dict[Field
     root = yaml.compose(text, yaml.SafeLoader) if _TAG.search(text) else None
     if root is None:
         return text, {}
-    parts, seen = [root], set[int]()
-    while parts:  # Taking a distribution from a node that stands twice would take both.
-        node = parts.pop()
-        if isinstance(node, yaml.CollectionNode):
-            remedy = "write it out"
-            require(id(node) not in seen, "YAML with distributions", "without *", "*", remedy)
-            seen.add(id(node))
-            inner = node.value
-            parts += [v for _, v in inner] if isinstance(node, yaml.MappingNode) else inner
+    for _, again in yaml_collections(root):  # Taking one from a node that stands twice takes both.
+        require(not again, "YAML with distributions", "without *", "*", "write it out")
     found: dict[FieldPath, Any] = {}
     _take(root, path, found)
     return yaml.serialize(root), found

@@ -77,6 +77,22 @@ def yaml_errors(source: str) -> Iterator[None]:
         raise ValueError(f"{source} is not YAML: its fields are nested too deeply") from None
 
 
+def yaml_collections(root: yaml.Node | None) -> Iterator[tuple[yaml.CollectionNode, bool]]:
+    """Yields the mappings and lists of a tree of YAML, and whether each stands there again, by an
+    alias."""
+    parts, seen = [root], set[int]()
+    while parts:
+        node = parts.pop()
+        if not isinstance(node, yaml.CollectionNode):
+            continue
+        again = id(node) in seen
+        yield node, again
+        if not again:
+            seen.add(id(node))
+            inner = node.value
+            parts += [v for _, v in inner] if isinstance(node, yaml.MappingNode) else inner
+
+
 def read_archive(path: Path) -> dict[str, np.ndarray]:
     """Reads the arrays of an `.npz` file by name; it may hold no Python objects."""
     require_file(path)

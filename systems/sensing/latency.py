@@ -185,11 +185,12 @@ class DecisionDelay(LeafSystem):
         self.DeclareDiscreteState(np.array([-period]))  # time of the newest decision [s]
         self.DeclareDiscreteState(self._kept * size)  # decisions that are kept, the newest first
         self._is_held = output == "command"
-        self.DeclareDiscreteState(size)  # the command
         self.DeclareVectorOutputPort(output, size, self._calc)
         self.DeclareInitializationDiscreteUpdateEvent(self._begin)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-        if self._is_held:  # sees what the update before it has written
+        if self._is_held:
+            self.DeclareDiscreteState(size)  # the command
+            # Sees what the update before it has written.
             self.DeclarePeriodicDiscreteUpdateEvent(step, 0.0, self._hold)
 
     def _decision(self, context: Context) -> np.ndarray:
@@ -197,7 +198,8 @@ class DecisionDelay(LeafSystem):
 
     def _begin(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(1, np.tile(self._decision(context), self._kept))
-        discrete_state.set_value(2, self._decision(context))
+        if self._is_held:
+            discrete_state.set_value(2, self._decision(context))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         decision, kept = self._decision(context), context.get_discrete_state(1).value()

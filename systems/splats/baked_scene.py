@@ -183,7 +183,8 @@ class BakedScene:
         """
         options = {"moving": moving, "distortion": distortion, "max_depth": max_depth}
         options |= {"background": background, "merged_spread": merged_spread, "rows": rows}
-        return self._render(_ALL, K, width, height, X_WC, near, far, **options)
+        camera = K, width, height, X_WC, near, far
+        return _render_all(self._render, self._antialiased, *camera, **options)
 
     def render_color(self, *camera: Any, **options: Any) -> NDArray[np.float32]:
         """Renders the color (H, W, 3), bitwise identical to that of `render` but faster.
@@ -212,17 +213,10 @@ class BakedScene:
         **options: Any,
     ) -> RenderedView:
         """Renders images of these names; the others are empty."""
-        if names == _ALL and self._antialiased:
-            # The blur of the color makes opacities lower than they are for depth.
-            arguments = K, width, height, X_WC, *clip
-            options |= {"background": background, "moving": moving}
-            depth = self._render(("depth",), *arguments, **options).depth
-            return self._render(("color", "alpha"), *arguments, **options)._replace(depth=depth)
         camera = _checked_camera(K, width, height, *clip, **options)
         (color,) = _background_colors([background])
         slopes = _slopes(K, width, height, [background], **options)
-        first, last = options.get("rows") or (0, height)
-        images = _new_images(names, (last - first, width))
+        images = _new_images(names, (), width, height, options.get("rows"))
         _native.render_baked(
             self._scene,
             self._renderer,
@@ -252,7 +246,8 @@ class BatchRenderer:
                 `moving`, with the N poses X_WC; all beyond `far` by name.
             options: the same; `backgrounds` are those of the N views, black by default.
         """
-        return self._render(_ALL, *cameras, **options)
+        apart = any(scene._antialiased for scene in cameras[0])
+        return _render_all(self._render, apart, *cameras, **options)
 
     def render_color(self, *cameras: Any, **options: Any) -> NDArray[np.float32]:
         """Renders the colors (N, H, W, 3) alone, which is faster; see `render`."""
@@ -280,14 +275,9 @@ class BatchRenderer:
         for name, rows in (("poses", X_WCs), ("backgrounds", backgrounds)):
             condition = f"that of scenes, {count}"
             require(len(rows) == count, f"the number of {name}", condition, len(rows))
-        if names == _ALL and any(scene._antialiased for scene in scenes):
-            arguments = scenes, K, width, height, X_WCs, *clip
-            options |= {"backgrounds": backgrounds}
-            depth = self._render(("depth",), *arguments, **options).depth
-            return self._render(("color", "alpha"), *arguments, **options)._replace(depth=depth)
         camera = _checked_camera(K, width, height, *clip, **options)
         slopes = _slopes(K, width, height, backgrounds, **options)
-        images = _new_images(names, (count, height, width))
+        images = _new_images(names, (count,), width, height, options.get("rows"))
         _native.render_views(
             self._renderer,
             [scene._scene for scene in scenes],
@@ -298,11 +288,30 @@ class BatchRenderer:
         return _finished(images, backgrounds, X_WCs, slopes)
 
 
-def _new_images(names: tuple[str, ...], shape: tuple[int, ...]) -> dict[str, NDArray[np.float32]]:
-    """Returns arrays for images (..., H, W, channels); others have no pixels."""
-    none = (*shape[:-2], 0, 0)
+def _render_all(
+    render: Callable[..., RenderedView], apart: bool, *cameras: Any, **options: Any
+) -> RenderedView:
+    """Renders all images, color and depth `apart` for scenes that were trained antialiased: blur
+    makes their opacities lower for color than for depth."""
+    if not apart:
+        return render(_ALL, *cameras, **options)
+    depth = render(("depth",), *cameras, **options).depth
+    return render(("color", "alpha"), *cameras, **options)._replace(depth=depth)
+
+
+def _new_images(
+    names: tuple[str, ...],
+    views: tuple[int, ...],
+    width: int,
+    height: int,
+    rows: tuple[int, int] | None,
+) -> dict[str, NDArray[np.float32]]:
+    """Returns arrays for images (*views, H, W, channels) of these rows; others have no pixels."""
+    first, last = rows or (0, height)
     return {
-        name: np.empty((*(shape if name in names else none), channels), np.float32)
+        name: np.empty(
+            (*views, *((last - first, width) if name in names else (0, 0)), channels), np.float32
+        )
         for name, channels in {"color": 3, "depth": 1, "alpha": 1}.items()
     }
 

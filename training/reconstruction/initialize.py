@@ -234,8 +234,8 @@ def resolve_config(config: ReconstructConfig, capture: Capture) -> ReconstructCo
         iterations = iterations if kind == "depth" else MAX_STEPS
     most = config.max_gaussians
     if not most:
-        given = kind == "depth" and strategy == "none" and iterations > 0
-        most = max(config.initial_gaussians, _MAX_FROM_DEPTH) if given else _MAX_ADDED
+        all_at_first = kind == "depth" and strategy == "none" and iterations > 0
+        most = max(config.initial_gaussians, _MAX_FROM_DEPTH) if all_at_first else _MAX_ADDED
     steps = {"strategy": strategy, "iterations": iterations, "max_gaussians": most}
     return replace(config, initialization=kind, **steps)
 

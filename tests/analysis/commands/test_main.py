@@ -73,7 +73,7 @@ RENDER = (
         ("fly --scene images", "got a folder without scene.yaml; of a capture, make a scene of"),
         ("scene measure folder", "must be a scene folder, got a folder without scene.yaml"),
         ("gap nowhere", "No such file or folder: nowhere; expected a scene, here or in scenes"),
-        ("replay folder a b --video", "2 flights must be without options, got ['--video']"),
+        ("replay folder a b --video", "2 flights must be without options, got --video; name one"),
         ("library make hospital --split train", "the split of hospital must be train, got test"),
         ("fly --scene room.gltf", RENDER),
         ("fly --scene damaged.ply", "damaged.ply"),

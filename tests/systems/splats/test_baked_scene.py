@@ -189,6 +189,10 @@ def test_rows_are_those_of_the_whole_image(lens, sky):
         part = scene.render(*CAMERA, X_WC, rows=rows, **options)
         for one, other in zip(part, whole, strict=True):
             np.testing.assert_allclose(one, other[slice(*rows)], atol=1e-5)
+        batch = BatchRenderer().render(
+            [scene], *CAMERA, [X_WC], backgrounds=[behind], distortion=lens, rows=rows
+        )
+        assert_equal_views([image[0] for image in batch], part)
     with pytest.raises(ValueError, match=r"rows must be in \[0, "):
         scene.render(*CAMERA, X_WC, rows=(3, HEIGHT + 1))
 
