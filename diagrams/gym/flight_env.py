@@ -42,13 +42,13 @@ from splatpilot.diagrams.gym.spaces import (
     Vehicles,
     action_space,
     decisions,
-    draw_flight,
     env_config,
     find_scenario,
     observation_space,
     observe,
     observe_image,
     require_actions,
+    require_options,
 )
 from splatpilot.diagrams.gym.world_pool import (
     NativeFlight,
@@ -57,7 +57,7 @@ from splatpilot.diagrams.gym.world_pool import (
 )
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import MAX_SEED, require
 from splatpilot.systems.vehicle.state import set_state
 
 
@@ -66,26 +66,21 @@ class FlightEnv(gymnasium.Env):
 
         env = gymnasium.make("splatpilot:Flight-v0", scenario="P02", observation=["depth", "goal"])
 
-    Observations are those of `observe` and `observe_image`, and outputs of the scenario's sensors
-    by their names, such as `imu_accelerometer`. Actions are in [-1, 1], see `decisions`. A flight
-    is terminated by a collision, at the goal, and outside of the known volume, and truncated by the
-    scenario's timeout; then `info` has the `outcome` and `is_success`. The vehicle's end is found
-    within 0.02 s.
+    Observations are those of `observe` and `observe_image`, and outputs of the scenario's sensors,
+    such as `imu_accelerometer`. Actions are in [-1, 1], see `decisions`. A flight is terminated by
+    a collision, at the goal, and outside of the known volume, and truncated by the scenario's
+    timeout; then `info` has the `outcome` and `is_success`. The end is found within 0.02 s.
 
     As in Drake's `DrakeGymEnv`, `simulator` is that of the present flight and `time_step` the time
-    of a step [s]. A reset with a seed makes flights bitwise identical. Resets draw the world, the
-    start and noise; only another world and noise need a new diagram.
+    of a step [s]. Resets draw the world, the start and noise; those with a seed repeat.
 
     Args:
-        scenario: of the flights: as such, a name such as "P02", or a YAML file. Its policy is not
-            used.
-        render_mode: "rgb_array" renders the scenario's camera; "human" serves Meshcat, in real
-            time.
+        scenario: as such, a name such as "P02", or a YAML file. Its policy is not used.
+        render_mode: "rgb_array": the scenario's camera; "human": Meshcat, in real time.
         native: flies by the native code of `VectorFlightEnv` if that knows all systems with a
             state, and sets the Context; otherwise, and in "human" mode, the simulator advances.
         world: of all flights; by default `num_worlds` are made of seeds from the scenario's on.
-        fields: of `FlightEnvConfig`, such as `observation`, `action`, `rate`, `reward` and
-            `num_worlds`.
+        fields: of `FlightEnvConfig`.
 
     Raises:
         InfeasibleFlightError: also by `reset`, for a world, start or goal that cannot be flown.
@@ -120,15 +115,12 @@ class FlightEnv(gymnasium.Env):
         world = self._find_world(self.config.scenario)
         self._take(self._find_flight(self.config.scenario, world))
         ports = self.parts.measured
-        self._spaces = {n: _port_space(ports[n]) for n in self._names() if n in ports}
+        names = self.config.observation_names()
+        self._spaces = {n: _port_space(ports[n]) for n in names if n in ports}
         self.observation_space = observation_space(self.config, self._spaces, ports)
         self.action_space = action_space(self.config)
 
-    def _names(self) -> list[str]:
-        return self.config.observation_names()
-
     def _find_world(self, scenario: Scenario) -> World:
-        """Returns the world of a scenario with the world's seed."""
         if self._world is not None:
             return self._world
         key = repr(scenario.world), scenario.seed
@@ -140,7 +132,6 @@ class FlightEnv(gymnasium.Env):
         return self._worlds[key]
 
     def _build(self, scenario: Scenario, world: World) -> "_BuiltFlight":
-        """Builds the diagram and the simulator of a flight."""
         builder, config = DiagramBuilder(), self.config
         policy = DecisionInput(config.action, config.camera, config.rate)
         camera = self.render_mode is not None
@@ -185,22 +176,20 @@ class FlightEnv(gymnasium.Env):
         super().reset(seed=seed)
         self._ended = True  # also if this fails
         options = options or {}
-        for name in options:
-            require(name in _OPTIONS, "options", f"of {', '.join(_OPTIONS)}", repr(name))
+        points = require_options(options, "scenario")
         if "scenario" in options:
             config = replace(self.config, scenario=find_scenario(options["scenario"]))
             config.validate()
             require(self._world is None, "world", "left out with options of a scenario", "a world")
             self.config = config
             self._flights.clear()
-        world_seed, scenario = draw_flight(self.config, self.np_random)
-        points = {name: list(options[name]) for name in ("start", "goal") if name in options}
+        base, draw = self.config.scenario, self.np_random.integers
+        world = self._find_world(replace(base, seed=base.seed + int(draw(self.config.num_worlds))))
+        scenario = replace(base, seed=int(draw(MAX_SEED)), **points)
         if points:
-            scenario = replace(scenario, **points)
             scenario.validate()
-        world = self._find_world(replace(self.config.scenario, seed=world_seed))
         self._take(self._find_flight(scenario, world))
-        if only_start_is_random(self.config.scenario):
+        if only_start_is_random(base):
             self._restart(scenario)
         else:
             context = self.simulator.get_mutable_context()
@@ -272,7 +261,7 @@ class FlightEnv(gymnasium.Env):
         return self._observe(), float(reward[0]), terminated, truncated, info
 
     def _observe(self) -> Any:
-        names, vehicles = self._names(), self._vehicles
+        names, vehicles = self.config.observation_names(), self._vehicles
         if self.parts.estimator is not None:
             vehicles = vehicles._replace(states=self._flight.eval("state")[None])
         self._estimates = vehicles.states
@@ -290,13 +279,12 @@ class FlightEnv(gymnasium.Env):
         context = self.simulator.get_context()
         if self.render_mode == "human":
             self.diagram.ForcedPublish(context)
-        if self.render_mode != "rgb_array" or self.parts.camera is None:
+        if self.render_mode != "rgb_array":
             return None
         image: Any = self.diagram.GetOutputPort("color_image").Eval(context)
         return np.array(image.data[..., :3])
 
 
-_OPTIONS = "scenario", "start", "goal"
 _MAX_WORLDS = 64  # that are kept
 
 
@@ -319,9 +307,8 @@ class _BuiltFlight:
         """Returns a copy of the vector or image at an output port."""
         port, context = self._ports[name]
         value: Any = port.Eval(context)
-        if port.get_data_type() == PortDataType.kVectorValued:
-            return np.array(value)
-        return np.array(value.data[..., 0] if value.data.shape[-1] == 1 else value.data)
+        is_vector = port.get_data_type() == PortDataType.kVectorValued
+        return np.array(value if is_vector else _plain(value.data))
 
     def vehicles(self) -> Vehicles:
         """Returns the vehicle, with its true state."""
@@ -330,11 +317,7 @@ class _BuiltFlight:
         return Vehicles(state[None], goal[None], distance, gradient[None])
 
 
-_IMAGES = {
-    ImageRgba8U: (255, np.uint8),
-    ImageDepth32F: (np.inf, np.float32),
-    ImageDepth16U: (65535, np.uint16),
-}
+_MAX_VALUES = {ImageRgba8U: 255, ImageDepth32F: np.inf, ImageDepth16U: 65535}
 
 
 def _port_space(port: OutputPort) -> Box:
@@ -342,9 +325,13 @@ def _port_space(port: OutputPort) -> Box:
     if port.get_data_type() == PortDataType.kVectorValued:
         return Box(-np.inf, np.inf, (port.size(),), np.float32)
     image: Any = port.Allocate().get_value()
-    known = ", ".join(kind.__name__ for kind in _IMAGES)
+    known = f"a vector or one of {', '.join(kind.__name__ for kind in _MAX_VALUES)}"
     what = f"the output {port.get_name()!r}"
-    require(type(image) in _IMAGES, what, f"a vector or one of {known}", type(image).__name__)
-    high, dtype = _IMAGES[type(image)]
-    shape = image.height(), image.width()
-    return Box(0, high, (*shape, 4) if isinstance(image, ImageRgba8U) else shape, dtype)
+    require(type(image) in _MAX_VALUES, what, known, type(image).__name__)
+    pixels = _plain(image.data)
+    return Box(0, _MAX_VALUES[type(image)], pixels.shape, pixels.dtype.type)
+
+
+def _plain(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Returns an image (H, W, n) without its last axis if n = 1."""
+    return pixels[..., 0] if pixels.shape[-1] == 1 else pixels

@@ -11,10 +11,10 @@ from pydrake.systems.framework import Context, LeafSystem, State
 from splatpilot.diagrams.flight.blocks import DECISIONS
 from splatpilot.diagrams.gym.spaces import (
     IMAGES,
-    OBSERVATIONS,
     FlightEnvConfig,
     Vehicles,
     decisions,
+    observation_space,
     observe,
     observe_image,
     require_actions,
@@ -38,18 +38,14 @@ class GymPolicy(LeafSystem):
         input_ports: [state, goal, (images)]
         output_ports: [(action)]
 
-    The inputs are ``state`` (13), ``goal`` (3), p_WG [m], and the images that the observations
-    need. The output has the name and size of `config.action`, see `AddFlight`. It is decided from
-    time 0 at `config.rate`, and held. Flights equal those of `FlightEnv` with the same actions.
+    The inputs are ``state`` (13), ``goal`` (3), p_WG [m], and the observed images. The output has
+    the name and size of `config.action`, see `AddFlight`. It is decided from time 0 at
+    `config.rate`, and held. Flights equal those of `FlightEnv` with the same actions.
 
     Args:
         predict: from the observation of one vehicle to its action (n,) in [-1, 1].
         config: of the environment of the training; of its scenario, gravity counts alone.
         world: of the flight, for the observation `obstacle`.
-
-    Raises:
-        ValueError: for outputs of sensors as observations, `obstacle` without a world, and at an
-            update for an action out of range.
     """
 
     def __init__(
@@ -60,10 +56,8 @@ class GymPolicy(LeafSystem):
     ) -> None:
         super().__init__()
         config.validate()
+        observation_space(config)  # checks the names
         self._predict, self._config, self._names = predict, config, config.observation_names()
-        for name in self._names:
-            known = f"one of {', '.join(OBSERVATIONS)} in GymPolicy"
-            require(name in OBSERVATIONS, "observation", known, repr(name))
         valid = world is not None or "obstacle" not in self._names
         require(valid, "world", "that of the flight for the observation obstacle", "None")
         self._field = world.distance_field if world and "obstacle" in self._names else None

@@ -4,7 +4,7 @@ The heading frame H has its origin in the vehicle, z up and x above the body's x
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -19,7 +19,6 @@ from splatpilot.systems.collision.distance_field import soft_barrier
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.distributions import is_distribution
 from splatpilot.systems.common.validation import (
-    MAX_SEED,
     Config,
     bounded,
     require,
@@ -102,19 +101,19 @@ class Vehicles(NamedTuple):
     gradients: NDArray[np.float64]  # (N, 3) of the distances by p_WB, in W; zero outside
 
 
-_SPEED, _RATE, _RANGE = 30.0, 20.0, 10.0  # [m/s], [rad/s], [m] at which observations are clipped
-_GOAL_UNIT = 10.0  # [m]
+_SPEEDS, _RATES = [30.0] * 3, [20.0] * 3  # [m/s] and [rad/s] at which observations are clipped
 
-# Bounds of observations that are vectors: those above clip, and distances to goals end at 1 km.
-_BOUNDS: dict[str, tuple[list[float], list[float]]] = {
-    "state": ([-_SPEED] * 3 + [-1.0] * 3 + [-_RATE] * 3, [_SPEED] * 3 + [1.0] * 3 + [_RATE] * 3),
-    "full_state": (
-        [-1e3] * 3 + [-_SPEED] * 3 + [-1.0] * 4 + [-_RATE] * 3,
-        [1e3] * 3 + [_SPEED] * 3 + [1.0] * 4 + [_RATE] * 3,
-    ),
-    "goal": ([-1.0] * 3 + [0.0], [1.0] * 3 + [100.0]),
-    "obstacle": ([-1.0] * 3 + [-_RANGE], [1.0] * 3 + [_RANGE]),
+# Bounds of observations that are vectors. Distances to goals end at 1 km.
+_BOUNDS = {
+    name: (-np.array(high), np.array(high))
+    for name, high in {
+        "state": [*_SPEEDS, *[1.0] * 3, *_RATES],
+        "full_state": [*[1e3] * 3, *_SPEEDS, *[1.0] * 4, *_RATES],
+        "goal": [*[1.0] * 3, 100.0],
+        "obstacle": [*[1.0] * 3, 10.0],
+    }.items()
 }
+_BOUNDS["goal"][0][3] = 0.0
 
 IMAGES = {"depth": "depth_image_32f", "depth_m": "depth_image_32f", "rgb": "color_image"}
 """Observations that are images, and the port of the policy's camera that each needs."""
@@ -149,8 +148,7 @@ def observation_space(
 
 def _space(name: str, camera: OnboardCamera) -> Box:
     if name in _BOUNDS:
-        low, high = (np.array(bound, dtype=np.float32) for bound in _BOUNDS[name])
-        return Box(low, high, dtype=np.float32)
+        return Box(*(bound.astype(np.float32) for bound in _BOUNDS[name]), dtype=np.float32)
     size = camera.height, camera.width
     if name == "depth_m":
         return Box(0.0, camera.max_depth, size, np.float32)
@@ -178,18 +176,15 @@ def observe(names: Sequence[str], vehicles: Vehicles) -> dict[str, NDArray[np.fl
             to_goal = vehicles.p_WG - p_WB
             distance = np.sqrt((to_goal * to_goal).sum(-1, keepdims=True))
             direction = to_goal / np.maximum(distance, 1e-9)
-            parts = [_to_heading(direction, *heading), distance / _GOAL_UNIT]
+            parts = [_to_heading(direction, *heading), distance / 10.0]
         elif name == "obstacle":
             distance = np.nan_to_num(vehicles.distances, nan=0.0)[..., None]
             parts = [_to_heading(vehicles.gradients, *heading), distance]
         else:
             continue
         whole = np.concatenate(parts, axis=-1) if len(parts) > 1 else parts[0]
-        observed[name] = np.clip(whole, *_CLIPS[name]).astype(np.float32)
+        observed[name] = np.clip(whole, *_BOUNDS[name]).astype(np.float32)
     return observed
-
-
-_CLIPS = {name: tuple(map(np.array, bounds)) for name, bounds in _BOUNDS.items()}
 
 
 def observe_image(name: str, image: NDArray[Any], max_depth: float) -> NDArray[Any]:
@@ -231,11 +226,19 @@ def require_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[np.float64]
     """Returns actions as floats; raises ValueError unless all are in [-1, 1] and of this shape."""
     given = np.asarray(actions, dtype=float)
     require(given.shape == shape, "shape of action", str(shape), given.shape)
-    if not (np.abs(given) <= 1.0).all():  # NaN too
-        worst = given[~(np.abs(given) <= 1.0)][0]
-        remedy = "clip actions, as gymnasium.wrappers.ClipAction does"
-        require(False, "action", "in [-1, 1]", worst, remedy)
+    outside = given[~(np.abs(given) <= 1.0)]  # NaN too
+    remedy = "clip actions, as gymnasium.wrappers.ClipAction does"
+    require(not outside.size, "action", "in [-1, 1]", next(iter(outside), None), remedy)
     return given
+
+
+def require_options(options: Mapping[str, Any], *others: str) -> dict[str, list[float]]:
+    """Returns `start` and `goal` of a reset's options; raises ValueError for names besides these
+    and `others`."""
+    known = *others, "start", "goal"
+    for name in options:
+        require(name in known, "options", f"of {', '.join(known)}", repr(name))
+    return {name: list(options[name]) for name in known[-2:] if name in options}
 
 
 def decisions(
@@ -263,7 +266,7 @@ def decisions(
 
 def _heading(q_WB: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns cosine and sine (N,) of headings, 1 and 0 if body x is vertical."""
-    w, x, y, z = (q_WB[..., i] for i in range(4))
+    w, x, y, z = q_WB.T
     along, left = w * w + x * x - y * y - z * z, 2.0 * (w * z + x * y)
     length = np.sqrt(along * along + left * left)
     is_vertical = length < 1e-9
@@ -275,23 +278,15 @@ def _to_heading(
     vectors: NDArray[np.float64], cos: NDArray[np.float64], sin: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Rotates vectors (N, 3) from W to H."""
-    rotated = np.empty_like(vectors)
-    x, y = vectors[..., 0], vectors[..., 1]
-    rotated[..., 0] = cos * x + sin * y
-    rotated[..., 1] = cos * y - sin * x
-    rotated[..., 2] = vectors[..., 2]
-    return rotated
+    x, y, z = vectors.T
+    return np.array([cos * x + sin * y, cos * y - sin * x, z]).T
 
 
 def _up(q_WB: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the body's z axis (N, 3) in W."""
-    w, x, y, z = (q_WB[..., i] for i in range(4))
-    norm2 = w * w + x * x + y * y + z * z
-    up = np.empty((*q_WB.shape[:-1], 3))
-    up[..., 0] = 2.0 * (x * z + w * y) / norm2
-    up[..., 1] = 2.0 * (y * z - w * x) / norm2
-    up[..., 2] = (w * w - x * x - y * y + z * z) / norm2
-    return up
+    w, x, y, z = q_WB.T
+    up = np.array([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z])
+    return (up / (w * w + x * x + y * y + z * z)).T
 
 
 @dataclass
@@ -372,14 +367,6 @@ class FlightEnvConfig(Config):
         return ends
 
 
-def draw_flight(config: FlightEnvConfig, generator: np.random.Generator) -> tuple[int, Scenario]:
-    """Draws the seed of the next flight's world, and its scenario, whose seed is that of start and
-    noise."""
-    world_seed = config.scenario.seed + int(generator.integers(config.num_worlds))
-    flight_seed = int(generator.integers(MAX_SEED))
-    return world_seed, replace(config.scenario, seed=flight_seed)
-
-
 def find_scenario(scenario: Scenario | str | Path) -> Scenario:
     """Returns a scenario, given as such, by the name of one that ships, or by a YAML file."""
     if isinstance(scenario, Scenario):
@@ -390,9 +377,8 @@ def find_scenario(scenario: Scenario | str | Path) -> Scenario:
 def env_config(scenario: Scenario | str | Path, **arguments: Any) -> FlightEnvConfig:
     """Returns the valid configuration of an environment of a scenario, see `find_scenario`."""
     known = [each.name for each in fields(FlightEnvConfig)[1:]]
-    for name in arguments:
-        if name not in known:
-            raise ValueError(unknown("argument", name, known))
+    for name in set(arguments) - set(known):
+        raise ValueError(unknown("argument", name, known))
     config = FlightEnvConfig(find_scenario(scenario), **arguments)
     config.validate()
     return config

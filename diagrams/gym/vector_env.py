@@ -12,6 +12,8 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform
+from pydrake.systems.sensors import CameraInfo
 
 from splatpilot import _native
 from splatpilot.diagrams.flight.flight_diagram import camera_info, camera_mount
@@ -34,19 +36,27 @@ from splatpilot.diagrams.gym.spaces import (
     observe,
     observe_image,
     require_actions,
+    require_options,
 )
-from splatpilot.diagrams.gym.world_pool import PACK, WorldPool, require_supported
+from splatpilot.diagrams.gym.world_pool import (
+    PACK,
+    VehicleArrays,
+    WorldPool,
+    integration_steps,
+    query,
+    require_supported,
+)
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.processes import available_cores
 from splatpilot.systems.common.validation import MAX_SEED, require, require_type
 from splatpilot.systems.sensing.latency import CYCLE
+from splatpilot.systems.splats.background import Background
 from splatpilot.systems.splats.baked_scene import BatchRenderer
 from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.state import pose_from_state
 
 # By the native ends, and one more
 _OUTCOMES = np.array([None, *ENDS, Outcome.TIMEOUT, TERMINATED], dtype=object)
-_OPTIONS = "reset_mask", "flight", "start", "goal"
 _GOAL, _TIMEOUT, _TERMINATED = map(
     list(_OUTCOMES).index, (Outcome.GOAL, Outcome.TIMEOUT, TERMINATED)
 )
@@ -81,7 +91,7 @@ class VectorFlightEnv(VectorEnv):
         fields: of `FlightEnvConfig`.
 
     Raises:
-        InfeasibleFlightError, ValueError: see `WorldPool`; ValueError also for invalid arguments.
+        InfeasibleFlightError, ValueError: see `WorldPool`.
     """
 
     def __init__(
@@ -126,14 +136,9 @@ class VectorFlightEnv(VectorEnv):
         alike = {"controller.period": periods, "simulator.max_step_size": steps}
         for name, values in (alike | {"vehicle.gravity": gravities}).items():
             require(len(values) == 1, name, "the same in all scenarios", sorted(values))
-        (period,), (step,) = periods, steps
-        # As Drake divides the time between updates of the controller.
-        count = max(1, int(np.ceil(period / step - 1e-6)))
-        self._steps = {
-            "periods": round(self.time_step / period),
-            "steps": count,
-            "step": period / count,
-        }
+        (period,) = periods
+        self._steps = {"periods": round(self.time_step / period)}
+        self._steps |= integration_steps(self.config.scenario)
         threads = threads or available_cores()
         self._threads, self._renderer = _native.FlightThreads(threads), BatchRenderer(threads)
         self.pool = pool or WorldPool(configs, world)
@@ -144,33 +149,14 @@ class VectorFlightEnv(VectorEnv):
     def _allocate(self) -> None:
         """Allocates the arrays of the N vehicles, which native code updates."""
         n, size = self.num_envs, cast(Box, self.single_action_space).shape[0]
-        packs = -(-n // PACK), len(_native.FLIGHT_PARAMETERS), PACK
         self._flight = np.zeros(n, int)  # index in the pool
-        self._states, self._p_WG = np.zeros((n, 13)), np.zeros((n, 3))
-        self._distances, self._gradients = np.zeros(n), np.zeros((n, 3))
-        self._field_states, self._ends = np.zeros(n, np.uint8), np.zeros(n, np.uint8)
-        self._thrusts, self._goal_radii = np.zeros(n), np.zeros(n)
-        self._remaining = np.zeros(n, np.int32)
-        self._field = np.zeros(n, np.int64)
-        self._parameters = np.ones(packs)
+        self._arrays = VehicleArrays(n, self.pool.radius)
+        self._gradients = np.zeros((n, 3))
         self._delays, self._decisions = np.zeros(n, np.int32), np.zeros((n, size))
         self._previous, self._count = np.zeros((n, size)), np.zeros(n, np.int64)
         self._seeds, self._episodes = np.zeros(n, np.uint64), np.zeros(n, np.uint64)
         self._choices = np.arange(len(self.pool))
         self._ended = np.ones(n, bool)
-        self._vehicles = _native.Vehicles(
-            states=self._states,
-            thrusts=self._thrusts,
-            parameters=self._parameters,
-            world=self._field,
-            goals=self._p_WG,
-            radii=np.full(n, self.pool.radius),
-            goal_radii=self._goal_radii,
-            remaining=self._remaining,
-            distances=self._distances,
-            field_states=self._field_states,
-            ends=self._ends,
-        )
         self._begun = np.zeros(n, bool)  # by a reset that did not fail
         self._last: Any = None  # observations, if environments are reset by masks
 
@@ -203,14 +189,9 @@ class VectorFlightEnv(VectorEnv):
             options: `reset_mask` (N,) of the environments to reset, all by default; for them
                 `flight`, a number of the pool's flights or one for each, and `start` and `goal` (3)
                 [m].
-
-        Returns:
-            Observations, and infos with the number `scenario` and the seeds `world_seed` and
-            `flight_seed` of flights.
         """
         options = options or {}
-        for name in options:
-            require(name in _OPTIONS, "options", f"of {', '.join(_OPTIONS)}", repr(name))
+        points = require_options(options, "reset_mask", "flight")
         mask = np.ones(self.num_envs, bool)
         if "reset_mask" in options:
             mask = np.asarray(options["reset_mask"])
@@ -224,7 +205,6 @@ class VectorFlightEnv(VectorEnv):
             flights = np.broadcast_to(np.asarray(options["flight"], int), rows.shape)
             condition = f"in [0, {len(self.pool)})"
             require(self._in_pool(flights), "flight", condition, flights.tolist())
-        points = {name: list(options[name]) for name in ("start", "goal") if name in options}
         self._begun[rows] = False  # also if this fails
         self._begin(rows, flights, points)
         self._begun[rows] = True
@@ -248,9 +228,9 @@ class VectorFlightEnv(VectorEnv):
             world = self.pool.worlds[self.pool.world[flight]]
             scenario = replace(self.pool.scenarios[flight], **points)
             scenario.validate()
-            self._states[row] = sample_initial_state(scenario, world)
-            self._p_WG[row] = goal_position(scenario, world)
-            self._distances[row] = world.distance_field.distance(self._states[row, :3])
+            arrays, state = self._arrays, sample_initial_state(scenario, world)
+            arrays.states[row], arrays.goals[row] = state, goal_position(scenario, world)
+            arrays.distances[row] = world.distance_field.distance(state[:3])
 
     def _seed(self, seed: int | Sequence[int | None] | None, mask: NDArray[np.bool_]) -> None:
         seeds: list[int | None] = [None] * self.num_envs
@@ -276,24 +256,22 @@ class VectorFlightEnv(VectorEnv):
     ) -> None:
         """Begins flights of the environments `rows`, drawn from the pool unless they are given;
         `points` moves their start or goal."""
-        pool = self.pool
+        pool, arrays = self.pool, self._arrays
         if flights is None:
             drawn = _hash(_hash(self._seeds[rows]) + self._episodes[rows])
             flights = self._choices[(drawn % np.uint64(len(self._choices))).astype(int)]
         self._episodes[rows] += np.uint64(1)
         self._flight[rows] = flights
-        self._states[rows], self._p_WG[rows] = pool.states[flights], pool.p_WG[flights]
-        self._parameters[rows // PACK, :, rows % PACK] = pool.parameters[flights]
-        self._thrusts[rows], self._remaining[rows] = pool.thrusts[flights], pool.periods[flights]
-        self._goal_radii[rows], self._field[rows] = pool.goal_radii[flights], pool.field[flights]
+        arrays.parameters[rows // PACK, :, rows % PACK] = pool.parameters[flights]
+        for name, values in pool.starts.items():
+            getattr(arrays, name)[rows] = values[flights]
         self._previous[rows], self._count[rows] = 0.0, 0
-        self._distances[rows] = pool.distances[flights]
         if points:
             self._move(rows, points)
-        self._ends[rows], self._ended[rows] = 0, False
+        arrays.ends[rows], self._ended[rows] = 0, False
         if pool.is_delayed:  # Until the first action has come, that of zeros counts.
             zeros = self._previous[rows]
-            self._decisions[rows] = decisions(self.config, zeros, self._states[rows])
+            self._decisions[rows] = decisions(self.config, zeros, arrays.states[rows])
 
     def step(
         self, actions: Any
@@ -315,13 +293,14 @@ class VectorFlightEnv(VectorEnv):
             self._begin(np.flatnonzero(resting))
         flying = ~resting
         # Copies by columns, which are several times faster to compute with.
-        before, p_WG = (np.array(each, order="F") for each in (self._states, self._p_WG))
+        arrays = self._arrays
+        before, p_WG = (np.array(each, order="F") for each in (arrays.states, arrays.goals))
         decided = np.ascontiguousarray(decisions(config, given, before))
         if self.pool.is_delayed:
             self._delays[:] = self.pool.delays[self._flight, self._count % CYCLE]
         self._threads.advance(
             self.pool.native,
-            self._vehicles,
+            arrays.native,
             kind=config.action,
             actions=decided,
             earlier=self._decisions,
@@ -330,15 +309,15 @@ class VectorFlightEnv(VectorEnv):
             actuated=self.pool.actuated,
             **self._steps,
         )
-        ends = self._ends
+        ends = arrays.ends
         ended, reached = ends > 0, ends == _GOAL
         truncated = ends == _TIMEOUT
         terminated = ended ^ truncated
         transition = Transition(
             states=before,
-            next_states=np.array(self._states, order="F"),
+            next_states=np.array(arrays.states, order="F"),
             p_WG=p_WG,
-            distances=self._distances.copy(),
+            distances=arrays.distances.copy(),
             actions=given,
             previous_actions=self._previous.copy(),
             reached=reached,
@@ -384,8 +363,8 @@ class VectorFlightEnv(VectorEnv):
         last = self._observe(rows)
         final = np.full(self.num_envs, None, dtype=object)
         for k, row in enumerate(rows):
-            is_whole = isinstance(last, dict)
-            final[row] = {name: v[k] for name, v in last.items()} if is_whole else last[k]
+            is_dict = isinstance(last, dict)
+            final[row] = {name: v[k] for name, v in last.items()} if is_dict else last[k]
         self._begin(rows)
         further = {"final_obs": final, "_final_obs": ended}
         further |= {"final_info": infos, "_final_info": ended.copy()} | self._drawn(ended)
@@ -405,18 +384,11 @@ class VectorFlightEnv(VectorEnv):
 
     def _observe(self, rows: NDArray[np.intp] | slice = slice(None)) -> Any:
         """Returns the observations of environments, in new arrays."""
-        names = self.config.observation_names()
-        states, p_WG = (np.array(each[rows], order="F") for each in (self._states, self._p_WG))
-        vehicles = Vehicles(states, p_WG, self._distances[rows], self._gradients[rows])
+        names, arrays = self.config.observation_names(), self._arrays
+        states, p_WG = (np.array(each[rows], order="F") for each in (arrays.states, arrays.goals))
+        vehicles = Vehicles(states, p_WG, arrays.distances[rows], self._gradients[rows])
         if "obstacle" in names:
-            distances, gradients = np.empty(len(states)), np.empty((len(states), 3))
-            self.pool.native.query(
-                p_WQ=np.ascontiguousarray(states[:, :3]),
-                world=self._field[rows],
-                distances=distances,
-                states=np.empty(len(states), np.uint8),
-                gradients=gradients,
-            )
+            distances, gradients = query(self.pool.native, states, arrays.world[rows])
             vehicles = vehicles._replace(distances=distances, gradients=gradients)
         observed: dict[str, Any] = {
             name: np.ascontiguousarray(values) for name, values in observe(names, vehicles).items()
@@ -433,16 +405,12 @@ class VectorFlightEnv(VectorEnv):
     def _render(self, rows: NDArray[np.intp] | slice, ports: set[str]) -> dict[str, NDArray]:
         """Renders images of the policy's camera, by the ports of `SplatCamera`."""
         camera = self.config.camera
-        info, X_BC = camera.camera_info(), camera.mount()
-        worlds = [self.pool.worlds[w] for w in self.pool.world[self._flight[rows]]]
-        X_WCs = [pose_from_state(state) @ X_BC for state in self._states[rows]]
-        scenes, size = [world.baked for world in worlds], (info.width(), info.height())
-        views = scenes, info.intrinsic_matrix(), *size, X_WCs
+        views, backgrounds = self._views(camera.camera_info(), camera.mount(), rows)
         options: dict[str, Any] = {
             "distortion": camera.distortion,
             "max_depth": camera.max_depth,
             "merged_spread": camera.merged_spread,
-            "backgrounds": [world.background for world in worlds],
+            "backgrounds": backgrounds,
         }
         images = {}  # In two passes: each leaves out what only the other needs.
         if "depth_image_32f" in ports:
@@ -452,6 +420,15 @@ class VectorFlightEnv(VectorEnv):
             images["color_image"] = color_pixels(self._renderer.render_color(*views, **options))
         return images
 
+    def _views(
+        self, info: CameraInfo, X_BC: RigidTransform, rows: NDArray[np.intp] | slice = slice(None)
+    ) -> tuple[tuple[Any, ...], list[Background]]:
+        """Returns scenes and views of a camera of each vehicle, and the backgrounds."""
+        worlds = [self.pool.worlds[w] for w in self.pool.world[self._flight[rows]]]
+        X_WCs = [pose_from_state(state) @ X_BC for state in self._arrays.states[rows]]
+        camera = info.intrinsic_matrix(), info.width(), info.height(), X_WCs
+        return ([w.baked for w in worlds], *camera), [w.background for w in worlds]
+
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Returns images (H, W, 3) of the scenario's camera, one of each vehicle."""
         if self.render_mode is None:
@@ -459,17 +436,8 @@ class VectorFlightEnv(VectorEnv):
         if not self._begun.all():
             raise ResetNeeded("flights must be begun by reset() before render()")
         config = self.config.scenario.camera
-        info, X_BC = camera_info(config), camera_mount(config)
-        worlds = [self.pool.worlds[w] for w in self.pool.world[self._flight]]
-        color = self._renderer.render_color(
-            [world.baked for world in worlds],
-            info.intrinsic_matrix(),
-            info.width(),
-            info.height(),
-            [pose_from_state(state) @ X_BC for state in self._states],
-            backgrounds=[world.background for world in worlds],
-        )
-        return tuple(color_pixels(color))
+        views, backgrounds = self._views(camera_info(config), camera_mount(config))
+        return tuple(color_pixels(self._renderer.render_color(*views, backgrounds=backgrounds)))
 
 
 def _hash(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:

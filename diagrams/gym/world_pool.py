@@ -18,7 +18,7 @@ from splatpilot.diagrams.flight.scenario import (
     sample_initial_state,
     sample_scenario,
 )
-from splatpilot.diagrams.gym.spaces import IMAGES, OBSERVATIONS, FlightEnvConfig, Vehicles
+from splatpilot.diagrams.gym.spaces import IMAGES, FlightEnvConfig, Vehicles
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -45,8 +45,6 @@ _LOOKS = 4  # the same for worlds of random appearance, since each flight has on
 
 class WorldPool:
     """Worlds that are baked and indexed, and flights in them that are ready to begin.
-
-    A flight is that of its scenario, with its seed, in its world: `AddFlight` flies the same.
 
     Args:
         configs: whose worlds and flights are made, alike but for their scenarios.
@@ -92,11 +90,6 @@ class WorldPool:
                 states.append(sample_initial_state(scenario, made))
                 self.scenarios.append(scenario)
         self.world = np.array(worlds)  # (F,), index of `worlds`
-        self.field = np.array([self._fields[id(w.distance_field)] for w in self.worlds])[worlds]
-        self.states = np.array(states)  # (F, 13)
-        self.p_WG = np.array(
-            [goal_position(s, self.worlds[w]) for s, w in zip(self.scenarios, worlds, strict=True)]
-        )
         period = configs[0].scenario.controller.period
         # (F, CYCLE), of decisions, in periods
         drawn = [decision_delays(s.decision_delay, s.seed, period) for s in self.scenarios]
@@ -105,21 +98,21 @@ class WorldPool:
         self.seeds = np.array([s.seed for s in self.scenarios])  # (F,), of flights
         self.world_seeds = np.array(world_seeds)  # (F,)
         self.scenario = np.array(numbers)  # (F,), index of `configs`
-        self.distances = np.empty(len(self))  # (F,) [m], from the start to surfaces
-        self.native.query(
-            p_WQ=np.ascontiguousarray(self.states[:, :3]),
-            world=self.field,
-            distances=self.distances,
-            states=np.empty(len(self), np.uint8),
-        )
+        fields = np.array([self._fields[id(w.distance_field)] for w in self.worlds])[worlds]
+        ends = zip(self.scenarios, worlds, strict=True)
+        self.starts = {  # (F, ...), by the names of `VehicleArrays`
+            "states": np.array(states),
+            "goals": np.array([goal_position(s, self.worlds[w]) for s, w in ends]),
+            "world": fields,
+            "distances": query(self.native, np.array(states), fields)[0],
+            "thrusts": np.array([s.vehicle.gravity for s in self.scenarios]),
+            "goal_radii": np.array([s.goal_radius for s in self.scenarios]),
+            "remaining": np.array([_periods(s) for s in self.scenarios]),
+        }
         self.parameters = np.array([native_parameters(s) for s in self.scenarios])  # (F, P)
         self.actuated = not all(
             s.vehicle.is_ideal() and not any(s.wind.mean) for s in self.scenarios
         )
-        self.thrusts = np.array([s.vehicle.gravity for s in self.scenarios])
-        self.goal_radii = np.array([s.goal_radius for s in self.scenarios])
-        limits = [math.ceil(s.timeout / period - 1e-6) for s in self.scenarios]
-        self.periods = np.array(limits, np.int32)  # (F,), of the controller until the timeout
         radii = {s.vehicle.radius for s in self.scenarios}
         require(len(radii) == 1, "vehicle.radius", "the same in all flights", sorted(radii))
         (self.radius,) = radii
@@ -138,7 +131,14 @@ class WorldPool:
         """Adds the distance field of a world to the native ones; returns the world, with the arrays
         of the last one if they are equal, as those of a captured scene are."""
         last, self._made = self._made, world
-        if last is not None and _are_equal(world, last):
+        if (
+            last is not None
+            and isinstance(world.distance_field, Esdf)
+            and isinstance(last.distance_field, Esdf)
+            and np.array_equal(world.gaussians.means, last.gaussians.means)
+            and np.array_equal(world.gaussians.sh, last.gaussians.sh)
+            and np.array_equal(world.esdf.distances, last.esdf.distances)
+        ):
             shared = {"distance_field": last.distance_field, "esdf": last.esdf}
             self._made = replace(world, gaussians=last.gaussians, rendered=last.baked, **shared)
             return self._made
@@ -148,17 +148,46 @@ class WorldPool:
         return world
 
 
-_OTHER = "use FlightEnv in gymnasium.vector.SyncVectorEnv"
+def _periods(scenario: Scenario) -> int:
+    """Returns the number of periods of the controller until the timeout."""
+    return math.ceil(scenario.timeout / scenario.controller.period - 1e-6)
 
 
-def _are_equal(world: World, other: World) -> bool:
-    fields = world.distance_field, other.distance_field
-    return (
-        all(isinstance(field, Esdf) for field in fields)
-        and np.array_equal(world.gaussians.means, other.gaussians.means)
-        and np.array_equal(world.gaussians.sh, other.gaussians.sh)
-        and np.array_equal(world.esdf.distances, other.esdf.distances)
+def integration_steps(scenario: Scenario) -> dict[str, Any]:
+    """Returns number and size [s] of steps in a period of the controller, as Drake divides it."""
+    period = scenario.controller.period
+    steps = max(1, math.ceil(period / scenario.simulator.max_step_size - 1e-6))
+    return {"steps": steps, "step": period / steps}
+
+
+class VehicleArrays:
+    """The arrays of N vehicles, which native code updates."""
+
+    def __init__(self, count: int, radius: float) -> None:
+        self.states, self.goals = np.zeros((count, 13)), np.zeros((count, 3))
+        self.distances, self.thrusts, self.goal_radii = np.zeros((3, count))
+        self.field_states, self.ends = np.zeros((2, count), np.uint8)
+        self.remaining, self.world = np.zeros(count, np.int32), np.zeros(count, np.int64)
+        self.parameters = np.ones((-(-count // PACK), len(_native.FLIGHT_PARAMETERS), PACK))
+        self.native = _native.Vehicles(**vars(self), radii=np.full(count, radius))
+
+
+def query(
+    worlds: _native.FlightWorlds, states: NDArray[np.float64], world: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns distances (N,) [m] and gradients (N, 3) of vehicles in worlds by number."""
+    distances, gradients = np.empty(len(states)), np.empty((len(states), 3))
+    worlds.query(
+        p_WQ=np.ascontiguousarray(states[:, :3]),
+        world=world,
+        distances=distances,
+        states=np.empty(len(states), np.uint8),
+        gradients=gradients,
     )
+    return distances, gradients
+
+
+_OTHER = "use FlightEnv in gymnasium.vector.SyncVectorEnv"
 
 
 def add_field(worlds: _native.FlightWorlds, field: DistanceField, name: str) -> int:
@@ -205,9 +234,6 @@ def require_supported(config: FlightEnvConfig, scenario: Scenario) -> None:
     }  # fmt: skip
     for name, (valid, condition, value) in neutral.items():
         require(valid, f"{name} of VectorFlightEnv", condition, value, _OTHER)
-    for name in config.observation_names():
-        known = f"one of {', '.join(OBSERVATIONS)} in VectorFlightEnv"
-        require(name in OBSERVATIONS, "observation", known, repr(name), _OTHER)
     longest, period = max(scenario.decision_delay, default=0.0), 1.0 / config.rate
     condition = f"at most the policy's period, {period:g} s, in VectorFlightEnv"
     require(longest <= period + 1e-9, "decision_delay", condition, longest, _OTHER)
@@ -261,55 +287,48 @@ class NativeFlight:
         self._worlds, self._threads = _native.FlightWorlds(), _native.FlightThreads(1)
         add_field(self._worlds, world.distance_field, world.name)
         self._parameters = native_parameters(scenario)
-        self._state, self._p_WG = np.zeros((1, 13)), np.zeros((1, 3))
-        self._distance, self._field_state = np.zeros(1), np.zeros(1, np.uint8)
-        self._end, self._remaining = np.zeros(1, np.uint8), np.zeros(1, np.int32)
-        self._world = np.zeros(1, np.int64)
-        self._vehicles = _native.Vehicles(
-            states=self._state,
-            thrusts=np.zeros(1),
-            parameters=np.repeat(self._parameters[None, :, None], PACK, axis=-1),
-            world=self._world,
-            goals=self._p_WG,
-            radii=np.full(1, scenario.vehicle.radius),
-            goal_radii=np.full(1, scenario.goal_radius),
-            remaining=self._remaining,
-            distances=self._distance,
-            field_states=self._field_state,
-            ends=self._end,
-        )
+        self._arrays = VehicleArrays(1, scenario.vehicle.radius)
+        self._arrays.parameters[:] = self._parameters[:, None]
+        self._arrays.goal_radii[:] = scenario.goal_radius
         self._period = scenario.controller.period
-        self._steps = max(1, int(np.ceil(self._period / scenario.simulator.max_step_size - 1e-6)))
-        self._limit = int(np.ceil(scenario.timeout / self._period - 1e-6))
+        self._steps = integration_steps(scenario)
+        self._limit = _periods(scenario)
         self._flying, self._delay = np.ones(1, bool), np.zeros(1, np.int32)
         self._with_gradient = "obstacle" in config.observation_names()
 
     def begin(self, state: NDArray[np.float64], p_WG: NDArray[np.float64]) -> None:
         """Begins a flight from a state (13,) to a goal (3,) [m]."""
-        self._state[0], self._p_WG[0], self._remaining[0] = state, p_WG, self._limit
-        self._query()
+        arrays = self._arrays
+        arrays.states[0], arrays.goals[0], arrays.remaining[0] = state, p_WG, self._limit
+        arrays.distances[:], _ = query(self._worlds, arrays.states, arrays.world)
 
     def step(self, decision: NDArray[np.float64], periods: int) -> Outcome | None:
         """Flies with a decision (1, n) for periods of the controller; returns the outcome."""
-        arrays = self._state, self._distance, self._field_state, self._remaining
-        start = [array.copy() for array in arrays]
+        arrays = self._arrays
+        changed = arrays.states, arrays.distances, arrays.field_states, arrays.remaining
+        start = [array.copy() for array in changed]
         if periods > 1:
             self._advance(decision, periods - 1)
-            if self._end[0]:  # Fly again until the last period.
-                flown = int(start[3][0] - self._remaining[0])
-                for array, first in zip(arrays, start, strict=True):
+            if arrays.ends[0]:  # Fly again until the last period.
+                flown = int(start[3][0] - arrays.remaining[0])
+                for array, first in zip(changed, start, strict=True):
                     array[:] = first
                 if flown > 1:
                     self._advance(decision, flown - 1)
-        before = self._state[0].copy()
+        before = arrays.states[0].copy()
         self._advance(decision, 1)
-        self._write(before, decision[0])
-        return _OUTCOMES[self._end[0]]
+        self._root.SetTime((self._limit - int(arrays.remaining[0])) * self._period)
+        set_state(self._plant, arrays.states[0].tolist())
+        if self._controller is not None:
+            command, kind = np.empty(4), self._config.action
+            _native.flight_command(kind, before, decision[0], self._parameters, command)
+            self._controller.SetDiscreteState(0, command)
+        return _OUTCOMES[arrays.ends[0]]
 
     def _advance(self, decision: NDArray[np.float64], periods: int) -> None:
         self._threads.advance(
             self._worlds,
-            self._vehicles,
+            self._arrays.native,
             kind=self._config.action,
             actions=decision,
             earlier=decision,
@@ -317,32 +336,13 @@ class NativeFlight:
             flying=self._flying,
             actuated=False,
             periods=periods,
-            step=self._period / self._steps,
-            steps=self._steps,
-        )
-
-    def _write(self, before: NDArray[np.float64], decision: NDArray[np.float64]) -> None:
-        """Sets time, state and command of the Context; `before` is the state at the command."""
-        self._root.SetTime((self._limit - int(self._remaining[0])) * self._period)
-        set_state(self._plant, self._state[0].tolist())
-        if self._controller is not None:
-            command = np.empty(4)
-            kind = self._config.action
-            _native.flight_command(kind, before, decision, self._parameters, command)
-            self._controller.SetDiscreteState(0, command)
-
-    def _query(self, gradients: NDArray[np.float64] | None = None) -> None:
-        self._worlds.query(
-            p_WQ=self._state[:, :3].copy(),
-            world=self._world,
-            distances=self._distance,
-            states=self._field_state,
-            gradients=gradients,
+            **self._steps,
         )
 
     def vehicles(self) -> Vehicles:
         """Returns the vehicle; its gradient is zero unless an observation needs it."""
-        gradients = np.zeros((1, 3))
+        arrays, gradients = self._arrays, np.zeros((1, 3))
         if self._with_gradient:
-            self._query(gradients)
-        return Vehicles(self._state.copy(), self._p_WG.copy(), self._distance.copy(), gradients)
+            _, gradients = query(self._worlds, arrays.states, arrays.world)
+        vehicle = arrays.states.copy(), arrays.goals.copy(), arrays.distances.copy()
+        return Vehicles(*vehicle, gradients)
