@@ -26,9 +26,10 @@ from splatpilot.systems.common.progress import resumable
 from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_registry import read_capture, read_scene_capture
+from splatpilot.training.captures.photographs import triangulate
 from splatpilot.training.reconstruction.checkpoint import kept_work
 from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
-from splatpilot.training.reconstruction.initialize import MAX_STEPS, held_out_frames, triangulate
+from splatpilot.training.reconstruction.initialize import MAX_STEPS, held_out_frames
 from splatpilot.training.reconstruction.metrics import floaters
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 

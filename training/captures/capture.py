@@ -53,12 +53,6 @@ class Lens:
         size = f"{self.width}x{self.height}"
         return f"fx {fx}, fy {fy}, cx {cx}, cy {cy} px for {size} px, from {self.source}"
 
-    @property
-    def is_eccentric(self) -> bool:
-        """True if the principal point is farther from the center than a quarter of the image."""
-        size = np.array([self.width, self.height])
-        return bool((np.abs(self.K[:2, 2] - size / 2) > size / 4).any())
-
     def pixels(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the image coordinates (N, 2) [px] of rays (N, 2), x/z and y/z."""
         if self.project is None:
@@ -92,8 +86,8 @@ def centered_pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.f
 def opencv_lens(
     K: NDArray[np.float64], width: int, height: int, distortion: Sequence[float], k4: float = 0.0
 ) -> Lens:
-    """Returns a lens of OpenCV's rational model. `distortion` is k1, k2, p1, p2, k3, ... in
-    OpenCV's order, `k4` the radial term of r^8, which OpenCV's model is without."""
+    """Returns a lens of OpenCV's rational model with k1, k2, p1, p2, k3, ... in OpenCV's order, and
+    `k4`, the radial term of r^8."""
     if not np.any(distortion) and not k4:
         return Lens(K, width, height)
     radial = [*distortion[:2], *distortion[4:]]
@@ -122,9 +116,8 @@ def _bent_lens(
 
 
 def common_pinhole(lenses: Sequence[Lens]) -> Lens:
-    """Returns the pinhole camera that images of all `lenses` are resampled into. It has the size
-    and center of the first, and the shortest focal length, not below the first's, at which every
-    one of its pixels is seen through every lens."""
+    """Returns the pinhole camera that images of all `lenses` are resampled into: of the first's
+    size and center and the shortest focal length, not below its, that every lens covers."""
     first = lenses[0]
     s, zero, one = np.linspace(0, 1, 33), np.zeros(33), np.ones(33)
     sides = np.stack([[s, zero], [s, one], [zero, s], [one, s]])  # (4, 2, 33)
@@ -133,12 +126,10 @@ def common_pinhole(lenses: Sequence[Lens]) -> Lens:
     def covers(zoom: float) -> bool:
         rays = (edge - first.K[:2, 2]) / (zoom * np.diag(first.K)[:2])
         for lens in lenses:
-            pixels = lens.pixels(rays)
-            size = np.array([lens.width, lens.height])
+            pixels, size = lens.pixels(rays), np.array([lens.width, lens.height])
             # Half a pixel outside the first centers is still within the image.
-            if not ((pixels > -0.5) & (pixels < size + 0.5)).all():
-                return False
-            if not (np.linalg.norm(pixels - size / 2, axis=1) <= lens.radius).all():
+            inside = ((pixels > -0.5) & (pixels < size + 0.5)).all(axis=1)
+            if not (inside & (np.linalg.norm(pixels - size / 2, axis=1) <= lens.radius)).all():
                 return False
         return True
 
@@ -146,8 +137,8 @@ def common_pinhole(lenses: Sequence[Lens]) -> Lens:
     index = bisect_left(zooms, True, key=covers)
     if index == len(zooms):
         raise ValueError(
-            "the cameras of this capture share too little of their view: no pinhole camera "
-            "sees through all of them; give the frames of one camera alone"
+            "no pinhole camera sees through all cameras of this capture, which share too little of "
+            "their view; give the frames of one camera alone"
         )
     K = first.K.copy()
     K[:2, :2] *= zooms[index]
@@ -187,8 +178,7 @@ def depth_points(
     """Returns the points p_CQ (N, 3) [m] of pixels of known, finite depth (H, W) [m], and their
     rows and columns, which begin at `start`."""
     part = depth[start::step, start::step]
-    rows, columns = np.nonzero((part > 0) & np.isfinite(part))
-    rows, columns = start + step * rows, start + step * columns
+    rows, columns = start + step * np.argwhere((part > 0) & np.isfinite(part)).T
     z = depth[rows, columns].astype(np.float64)
     return back_project(K, columns + 0.5, rows + 0.5, z), rows, columns
 
@@ -228,8 +218,7 @@ def register_depth(
     width: int,
     height: int,
 ) -> NDArray[np.float32]:
-    """Carries a depth image (h, w) [m] into the pixels of the color camera, in which the nearest
-    point wins; 0 unknown, inf beyond range."""
+    """Returns the nearest depth [m] in each pixel of the color camera; 0 unknown, inf too far."""
     # At least one point per pixel of C, so that surfaces behind do not shine through.
     finer = max(1, int(np.ceil(1.05 * K[0, 0] / camera.K[0, 0])))
     z = np.where(np.isinf(depth), _FAR, depth).repeat(finer, axis=0).repeat(finer, axis=1)
@@ -238,10 +227,9 @@ def register_depth(
     inside, rows, columns = project_points(K, p_CQ, width, height)
     nearest = np.full((height, width), np.inf)
     np.minimum.at(nearest, (rows, columns), p_CQ[inside, 2])
-    hit = np.zeros((height, width), dtype=bool)
-    hit[rows, columns] = True
+    nearest[np.isinf(nearest)] = 0
     nearest[nearest > _FAR / 2] = np.inf
-    return np.where(hit, nearest, 0).astype(np.float32)
+    return nearest.astype(np.float32)
 
 
 _EVERYWHERE = np.ones((1, 1), dtype=bool)
@@ -403,9 +391,8 @@ def _blocks(pixels: NDArray, factor: int) -> NDArray:
 def shrink(frame: CaptureFrame, factor: int) -> CaptureFrame:
     """Returns the frame with each factor x factor pixels made one; the remainder is cut off.
 
-    Colors are averaged. Inverse depth is averaged, exactly on planes, if it is of one surface; at
-    edges depth is the (lower) median. It is unknown (0) where most of it is. A pixel is valid if
-    all that it replaces are.
+    Colors are averaged. Inverse depth of one surface is averaged, exactly on planes; at edges depth
+    is the (lower) median. It is 0 where most of it is. A pixel is valid if all it replaces are.
     """
     if factor == 1:
         return frame

@@ -114,7 +114,7 @@ class CaptureConfig(Config):
         ]
 
 
-def complete_config(path: Path, config: CaptureConfig | None) -> CaptureConfig:
+def complete_config(path: Path, config: CaptureConfig) -> CaptureConfig:
     """Returns `config`, its open fields taken from the capture's own `capture.yaml`."""
     file = path / CONFIG_FILE
     completed = CaptureConfig()
@@ -122,8 +122,7 @@ def complete_config(path: Path, config: CaptureConfig | None) -> CaptureConfig:
         completed = load_config(completed, file)
         with errors_about(file):
             completed.validate()
-    if config is not None:
-        completed = load_config(completed, overrides=config.settings())
+    completed = load_config(completed, overrides=config.settings())
     completed.validate()
     return completed
 
@@ -142,21 +141,17 @@ def cache_key(paths: Iterable[Path], *others: object) -> str:
     return key.hexdigest()[:16]
 
 
-def prepare_cache(folder: Path) -> None:
-    """Makes a cache folder and removes leftovers of interrupted writers."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OSError(
-            f"{folder}: cannot be written ({error.strerror}); set capture.cache to another folder"
-        ) from None
-    files.remove_leftovers(folder)
-
-
 def cached_folder(folder: Path, write: Callable[[Path], None]) -> Path:
     """Returns a folder of the cache, written atomically by `write` if it is missing."""
     if not folder.is_dir():
-        prepare_cache(folder.parent)
+        try:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OSError(
+                f"{folder.parent}: cannot be written ({error.strerror}); set capture.cache to "
+                "another folder"
+            ) from None
+        files.remove_leftovers(folder.parent)
         with files.folder_written_atomically(folder) as written:
             write(written)
     return folder

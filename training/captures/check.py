@@ -1,8 +1,7 @@
 """Checks that poses, intrinsics and depth of a capture agree, and finds a likely error if not.
 
-Without depth, features that are matched between frames must lie on their epipolar lines. The
-capture as read, and readings of its files that each undo one known error, are measured on the
-same pairs of frames.
+The capture as read, and readings of its files that each undo one known error, are measured on the
+same pairs of frames: by depth or, without any, by the epipolar lines of features.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,12 +43,11 @@ _IMAGE_FACTORS = (0.25, 0.5, 0.75, 4 / 3, 2.0, 4.0)
 _MIN_POINTS = 200  # in all pairs together, for a conclusion
 _MIN_INSIDE = 0.1  # fraction of points that must fall onto measured depth for a reading to count
 _TOLERANCE = 0.02  # median relative error up to which a capture agrees with itself
-_NEGLIGIBLE = 0.002  # median relative error up to which other readings are ignored
+_NEGLIGIBLE = 0.002  # median error up to which other readings are ignored
 _MIN_GAIN = 0.5  # maximum fraction of the error that another reading may leave to be accepted
 _DEPTH_POINTS = 5000  # approximate number of pixels per image whose depth is compared
 
-# The same of epipolar errors, in focal lengths.
-_EPIPOLAR_TOLERANCE, _EPIPOLAR_NEGLIGIBLE = 0.01, 0.002
+_EPIPOLAR_TOLERANCE = 0.01  # the same of epipolar errors, in focal lengths
 _MIN_BEFORE = 0.5  # fraction of points that must lie before both cameras for a reading to count
 _ZOOMS = (0.75, 4 / 3)  # other focal lengths that frames must tell from the right one
 
@@ -93,12 +91,9 @@ class ReadingFit:
 
     name: str
     error: float
-    """Median of |z' / z - 1|, depth z carried into another frame and z' found there; infinite if
-    the frames hardly overlap. Without depth the median distance of features from their epipolar
-    lines, in focal lengths."""
-    inside: float
-    """Fraction of points that fall onto measured depth in the other frame or, without depth, that
-    lie before both cameras."""
+    """Median of |z' / z - 1|, depth z carried into another frame and z' found there, or distance of
+    features from their epipolar lines, in focal lengths; infinite if the frames hardly overlap."""
+    inside: float  # fraction of points on measured depth of the other frame, or before both cameras
 
 
 @dataclass(frozen=True)
@@ -202,36 +197,54 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
     found = _choose_pairs(capture, pairs)
     if sum(len(pair.depth) for pair in found) < _MIN_POINTS:
         raise ValueError(f"{capture.source}: too few pixels have depth in two frames to compare")
-    K = (capture.depth_camera or capture).K
-    as_read = Reading("as it was read", K, capture.axes.R_BC)
-    agreement = _measure(as_read, found)
+
+    def measure(reading: Reading) -> ReadingFit:
+        error = np.concatenate([_relative_errors(reading, pair) for pair in found])
+        inside = len(error) / sum(len(pair.depth) for pair in found)
+        median = float(np.median(error)) if inside >= _MIN_INSIDE else np.inf
+        return ReadingFit(reading.name, median, inside)
+
+    as_read = Reading("as it was read", (capture.depth_camera or capture).K, capture.axes.R_BC)
+    agreement = measure(as_read)
     readings = _pose_readings(as_read) + _depth_readings(as_read)
-    readings += _camera_readings(as_read, capture)
-    readings += _fitted_readings(as_read, lambda reading: _measure(reading, found))
-    others = sorted((_measure(each, found) for each in readings), key=lambda fit: fit.error)
-    best, color = others[0], None
+    readings += _camera_readings(as_read, capture) + _fitted_readings(as_read, measure)
+    others, color = _sorted_fits(measure, readings), None
     X_CW = capture.X_WCs[0].inverse()
     if all((X_CW @ X_WC).IsNearlyIdentity(1e-9) for X_WC in capture.X_WCs):
         problem = (
             f"all {len(capture)} poses are the same; if the camera moved, look at the file that "
             "they were read from"
         )
-    elif agreement.error > _NEGLIGIBLE and best.error < _MIN_GAIN * agreement.error:
-        problem = (
-            f"most likely {best.name}: the median error would be {best.error:.2%} instead of "
-            f"{agreement.error:.2%}"
-        )
-    elif agreement.error > _TOLERANCE:
-        problem = (
-            f"the median error of depth between frames is {agreement.error:.1%}, more than "
-            f"{_TOLERANCE:.0%}, and no other reading explains it (the best, {best.name}, "
-            f"leaves {best.error:.1%}); poses may be inaccurate, try capture.refine_poses, or "
-            "things may have moved"
-        )
     else:
+        what = "the median error of depth between frames"
+        remedy = ", try capture.refine_poses"
+        problem = _find_problem(agreement, others[0], _TOLERANCE, what, remedy)
+    if not problem:
         color = fit_color_camera(capture, [pair.frames for pair in found])
         problem = color.problem if color is not None else ""
-    return CheckReport(capture, len(found), agreement, tuple(others), color, problem)
+    return CheckReport(capture, len(found), agreement, others, color, problem)
+
+
+def _sorted_fits(
+    measure: Callable[[Reading], ReadingFit], readings: Sequence[Reading]
+) -> tuple[ReadingFit, ...]:
+    return tuple(sorted(map(measure, readings), key=lambda fit: fit.error))
+
+
+def _find_problem(
+    agreement: ReadingFit, best: ReadingFit, tolerance: float, what: str, remedy: str = ""
+) -> str:
+    """Returns the most likely error, given the best other reading; empty without any."""
+    if agreement.error > _NEGLIGIBLE and best.error < _MIN_GAIN * agreement.error:
+        left = f"would be {best.error:.2%} instead of {agreement.error:.2%}"
+        return f"most likely {best.name}: {what} {left}"
+    if agreement.error <= tolerance:
+        return ""
+    return (
+        f"{what} is {agreement.error:.1%}, more than {tolerance:.0%}, and no other reading "
+        f"explains it (the best, {best.name}, leaves {best.error:.1%}); poses may be inaccurate"
+        f"{remedy}, or things may have moved"
+    )
 
 
 def _check_features(capture: Capture, pairs: int) -> CheckReport:
@@ -270,24 +283,14 @@ def _check_features(capture: Capture, pairs: int) -> CheckReport:
     k1 = float(bend[0])
     name = f"the images are still distorted: k1 = {k1:.2f} fits best"
     readings.append(replace(as_read, name=name, bend=k1))
-    agreement = measure(as_read)
-    others = sorted(map(measure, readings), key=lambda fit: fit.error)
-    best, problem = others[0], ""
-    left = f"{best.error:.2%} of the focal length instead of {agreement.error:.2%}"
-    if agreement.error > _EPIPOLAR_NEGLIGIBLE and best.error < _MIN_GAIN * agreement.error:
-        problem = f"most likely {best.name}: features would miss their epipolar lines by {left}"
-    elif agreement.error > _EPIPOLAR_TOLERANCE:
-        problem = (
-            f"features miss their epipolar lines by {agreement.error:.1%} of the focal length, "
-            f"more than {_EPIPOLAR_TOLERANCE:.0%}, and no other reading explains it (the best, "
-            f"{best.name}, leaves {best.error:.1%}); poses may be inaccurate, or things may have "
-            "moved"
-        )
+    agreement, others = measure(as_read), _sorted_fits(measure, readings)
+    what = "the median distance of features from their epipolar lines, in focal lengths,"
+    problem = _find_problem(agreement, others[0], _EPIPOLAR_TOLERANCE, what)
     # Along the optical axis any focal length fits, if distances along it grow alike.
     undetermined, focal = "", as_read.K[0, 0]
     zoomed = [(z * focal, as_read.K @ np.diag([z, z, 1.0])) for z in _ZOOMS]
     error, other = min((measure(replace(as_read, K=K)).error, f) for f, K in zoomed)
-    fits = error < max(2.0 * agreement.error, _EPIPOLAR_NEGLIGIBLE)
+    fits = error < max(2.0 * agreement.error, _NEGLIGIBLE)
     if fits and not problem and not capture.config.intrinsics:
         angle = 2.0 * np.degrees(np.arctan2(capture.width / 2, focal))
         undetermined = (
@@ -295,13 +298,12 @@ def _check_features(capture: Capture, pairs: int) -> CheckReport:
             f"{focal:.0f} px, a field of view of {angle:.0f} degrees; film turns and motion to the "
             "side, too, or set capture.intrinsics"
         )
-    return CheckReport(capture, len(matched), agreement, tuple(others), None, problem, undetermined)
+    return CheckReport(capture, len(matched), agreement, others, None, problem, undetermined)
 
 
 def _choose_pairs(capture: Capture, count: int) -> list[FramePair]:
-    """Chooses frames spread over the capture, each with a later one that sees it differently. That
-    is at most 16 frames later: the first whose camera has moved by an eighth of the median depth or
-    rotated by ten degrees, but by no more than 45, else the last."""
+    """Chooses frames spread over the capture, each with one of the next 16: the first whose camera
+    has moved by an eighth of the median depth or rotated by 10 to 45 degrees, else the last."""
     camera = capture.depth_camera
     X_CD = camera.X_CD if camera is not None else RigidTransform()
     X_DB = X_CD @ RigidTransform(capture.axes.R_BC.inverse())
@@ -337,13 +339,6 @@ def _later_frame(capture: Capture, i: int, depth: float) -> int | None:
         if moved and abs(angle) < np.deg2rad(45):
             break
     return j
-
-
-def _measure(reading: Reading, pairs: Sequence[FramePair]) -> ReadingFit:
-    error = np.concatenate([_relative_errors(reading, pair) for pair in pairs])
-    inside = len(error) / sum(len(pair.depth) for pair in pairs)
-    median = float(np.median(error)) if inside >= _MIN_INSIDE else np.inf
-    return ReadingFit(reading.name, median, inside)
 
 
 def _relative_errors(reading: Reading, pair: FramePair) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.validation import require
+from splatpilot.training.captures.capture import project
 
 _MAX_NODES = 1_000_000  # of the grid in which free space is found
 _REACH = (4.0, 10.0)  # [m], of a camera that sees a surface well: indoors, and at most outdoors
@@ -52,8 +53,7 @@ class CapturePlan:
         return float(np.mean(self.views >= self.required))
 
     def picture(self) -> NDArray[np.uint8]:
-        """Draws a top view (H, W, 3), red, green, blue: patches that are seen from too few
-        directions in red (none) to yellow, from enough in gray; cameras in blue."""
+        """Draws a top view (H, W, 3), red, green, blue, of patches and cameras; see its legend."""
         lower, upper = self.p_WQ.min(axis=0)[:2], self.p_WQ.max(axis=0)[:2]
         scale = 1000 / max(upper - lower)  # [px/m]
         radius = max(2, int(0.4 * scale * self.reach / _PATCHES))
@@ -73,14 +73,13 @@ class CapturePlan:
             here, ahead = X_WC.translation(), X_WC.rotation().matrix()[:, 2]
             cv2.line(image, pixel(here), pixel(here + 0.5 * ahead), (30, 60, 220), 1)
             cv2.circle(image, pixel(here), 2, (30, 60, 220), -1)
-        for k, (name, color) in enumerate(
-            {
-                "never seen": (220, 0, 0),
-                f"from too few of {self.required} directions": (220, 150, 0),
-                "seen from enough": (150, 150, 150),
-                "cameras": (30, 60, 220),
-            }.items()
-        ):
+        legend = {
+            "never seen": (220, 0, 0),
+            f"from too few of {self.required} directions": (220, 150, 0),
+            "seen from enough": (150, 150, 150),
+            "cameras": (30, 60, 220),
+        }
+        for k, (name, color) in enumerate(legend.items()):
             row = height + (k + 1) * _LEGEND // 5
             cv2.putText(image, name, (radius, row), cv2.FONT_HERSHEY_SIMPLEX, 0.5, color)
         return image
@@ -99,10 +98,9 @@ def plan_capture(
 ) -> CapturePlan:
     """Plans the poses of a camera, in the order of a short path.
 
-    The free space is that between two heights above the surface below. Of its connected parts, the
-    largest is taken that does not touch the border of the field, unless that is small. Poses are
-    chosen one after another, each the one that sees most patches of surfaces from a direction that
-    they still need (greedy set cover).
+    The free space is that between two heights above the surface below, its largest connected part
+    that does not touch the border of the field, unless that is small. Each pose is the one that
+    sees most patches of surfaces from a direction that they still need (greedy set cover).
 
     Args:
         K, size: (3, 3) intrinsics, width and height [px].
@@ -148,8 +146,7 @@ def _count(patch: NDArray, direction: NDArray, size: int) -> NDArray[np.intp]:
 def _free_space(
     esdf: Esdf, heights: tuple[float, float], clearance: float, inside: NDArray | None
 ) -> tuple[NDArray[np.float64], float, list[tuple[float, NDArray[np.float64]]]]:
-    """Returns nodes (N, 3) [m] of the space in which the camera moves, and their spacing [m]; and
-    the areas [m^2] and a point (3,) [m] each of the parts that only `clearance` cuts off."""
+    """Returns nodes (N, 3) [m] of the camera's space, their spacing [m], and other parts of it."""
     extent = esdf.upper_W - esdf.lower_W
     spacing = max(esdf.voxel_size, 0.2, float(np.cbrt(np.prod(extent) / _MAX_NODES)))
     shape = np.maximum((extent / spacing).astype(int), 1).tolist()
@@ -157,7 +154,8 @@ def _free_space(
     found = esdf.distance(p_WN)
     above = p_WN[..., 2] - _surface_below(esdf, p_WN, spacing)
     low, high = heights
-    usable = (found > clearance) & (above >= low) & (above <= high)
+    between = (above >= low) & (above <= high)
+    usable = between & (found > clearance)
     parts, count = cast(Any, label(usable, np.ones((3, 3, 3))))
     if count == 0:
         raise ValueError(
@@ -177,8 +175,7 @@ def _free_space(
         enclosed = sizes.copy()
         enclosed[np.unique(border)] = 0
         part = sizes.argmax() if enclosed.max() < _OUTSIDE * sizes.max() else enclosed.argmax()
-    wider = (found > min(clearance, esdf.voxel_size)) & (above >= low) & (above <= high)
-    wider, _ = cast(Any, label(wider))
+    wider, _ = cast(Any, label(between & (found > min(clearance, esdf.voxel_size))))
     numbers = np.unique(parts[np.isin(wider, wider[parts == part])])
     left = [p_WN[parts == other] for other in numbers if other not in (0, part)]
     others = [(_area(nodes, spacing), nodes[len(nodes) // 2]) for nodes in left]
@@ -232,8 +229,8 @@ def _one_per_cell(p_WN: NDArray, size: float) -> NDArray[np.intp]:
 
 
 def _patches(esdf: Esdf, size: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns points (N, 3) [m] before surfaces, and their normals: one for the faces of voxels in
-    each cell of `size` [m] that have the same normal, if they are at least a fifth of a square."""
+    """Returns points (N, 3) [m] before surfaces, and their normals: one per normal and cell of
+    `size` [m], if its faces are at least a fifth of a square."""
     occupied = esdf.states == FieldState.OCCUPIED
     voxel = esdf.voxel_size
     points, normals = [], []
@@ -290,11 +287,9 @@ def _candidates(
     for yaw in _YAWS:
         for pitch in _PITCHES:
             R_WC = look_along(np.zeros(3), yaw, pitch).rotation().matrix()
-            rays = -toward @ R_WC
-            with np.errstate(divide="ignore", invalid="ignore"):
-                u = K[0, 0] * rays[:, 0] / rays[:, 2] + K[0, 2]
-                v = K[1, 1] * rays[:, 1] / rays[:, 2] + K[1, 2]
-            seen = (rays[:, 2] > 0) & (u >= 0) & (v >= 0) & (u <= size[0]) & (v <= size[1])
+            x, y, z = (-toward @ R_WC).T
+            u, v = project(K, x, y, z)
+            seen = (z > 0) & (u >= 0) & (v >= 0) & (u <= size[0]) & (v <= size[1])
             for k, p_WC in enumerate(stops):
                 lines = order[edges[k] : edges[k + 1]]
                 lines = lines[seen[lines]]
@@ -310,15 +305,8 @@ def _cover(
     required: NDArray[np.intp],
     max_frames: int,
 ) -> tuple[list[int], int]:
-    """Chooses candidates until no further one is worth it; returns at most `max_frames` of them,
-    and the number of the others."""
+    """Returns at most `max_frames` candidates that are worth it, and the number of the others."""
     missing, has = required.copy(), np.zeros((len(required), 27), dtype=bool)
-
-    def new(index: int) -> NDArray[np.intp]:
-        """Returns the lines of sight of a candidate that are still needed."""
-        lines = candidates[index][1]
-        return lines[(missing[patch[lines]] > 0) & ~has[patch[lines], direction[lines]]]
-
     # Gains only shrink: a candidate whose present gain is the largest bound is the best.
     queue = [(-len(lines), index) for index, (_, lines) in enumerate(candidates)]
     heapq.heapify(queue)
@@ -326,7 +314,8 @@ def _cover(
     chosen = []
     while queue and -queue[0][0] >= worth:
         _, index = heapq.heappop(queue)
-        lines = new(index)
+        lines = candidates[index][1]
+        lines = lines[(missing[patch[lines]] > 0) & ~has[patch[lines], direction[lines]]]
         if queue and len(lines) < -queue[0][0]:
             heapq.heappush(queue, (-len(lines), index))
             continue

@@ -1,8 +1,7 @@
 """Opens captures that keep their frames in files.
 
 Frames with a missing, damaged or differently sized file, or with an invalid or distant pose, are
-left out, with a message each in `Capture.dropped`. More than a fifth of those with an image are
-an error, because then the capture is read wrongly.
+left out and named in `Capture.dropped`. More than a fifth of those with an image are an error.
 """
 
 import re
@@ -62,13 +61,8 @@ def existing_file(file: Path) -> Path:
     return file
 
 
-def image_size(file: Path) -> tuple[int, int]:
-    """Returns width and height [px] of an image without decoding it."""
-    return _image_header(file)[0]
-
-
-def _image_header(file: Path) -> tuple[tuple[int, int], str]:
-    """Returns width and height [px], and Pillow's mode of the pixels."""
+def image_header(file: Path) -> tuple[tuple[int, int], str]:
+    """Returns width and height [px] of an image, and Pillow's mode, without decoding it."""
     readers.require_file(file)
     with readers.readable(file, "image"):
         with Image.open(file) as image:
@@ -93,7 +87,7 @@ def _depth_size(file: Path) -> tuple[int, int]:
         shape, dtype = readers.array_layout(file)
         _require_depth(file, shape, dtype)
         return shape[1], shape[0]
-    size, mode = _image_header(file)
+    size, mode = image_header(file)
     require(mode not in _NO_DEPTH, f"{file}: depth", _DEPTH, f"an image of mode {mode}")
     return size
 
@@ -405,8 +399,9 @@ def _notes(lenses: Sequence[Lens], masked: int, transparent: int, total: int) ->
     notes = [f"intrinsics: {lenses[0]}"]
     if len(lenses) > 1:
         notes[0] += f", and {len(lenses) - 1} more cameras"
-    if eccentric := [lens for lens in lenses if lens.is_eccentric]:
-        cx, cy = eccentric[0].K[:2, 2].round(1).tolist()
+    centers = [(lens.K[:2, 2], np.array([lens.width, lens.height])) for lens in lenses]
+    if far := [center for center, size in centers if (np.abs(center / size - 0.5) > 0.25).any()]:
+        cx, cy = far[0].round(1).tolist()
         notes.append(
             f"the principal point ({cx}, {cy}) px is far from the center of the images; are "
             "intrinsics those of images of this size?"
@@ -424,11 +419,11 @@ def _inspect(frame: FrameFiles) -> _Frame:
     parts = ("image", "depth", "mask")
     found = {name: file and existing_file(file) for name in parts if (file := getattr(frame, name))}
     frame = replace(frame, **found)
-    size, mode = _image_header(frame.image)
+    size, mode = image_header(frame.image)
     if frame.lens is not None:
         _check_size(frame.image, size, (frame.lens.width, frame.lens.height))
     if frame.mask is not None:
-        _check_size(frame.mask, image_size(frame.mask), size)
+        _check_size(frame.mask, image_header(frame.mask)[0], size)
     depth_size = _depth_size(frame.depth) if frame.depth is not None else None
     return _Frame(frame, size, depth_size, mode in _ALPHA, frame.X_FB())
 

@@ -33,7 +33,7 @@ from splatpilot.training.captures.frames import (
     IMAGE_SUFFIXES,
     FrameFiles,
     existing_file,
-    image_size,
+    image_header,
     open_frames,
     pose_from_matrix,
 )
@@ -170,7 +170,7 @@ def _lens(
         if "w" in values and "h" in values:
             width, height = int(values["w"]), int(values["h"])
         else:
-            width, height = image_size(image)
+            width, height = image_header(image)[0]
         if config.intrinsics:
             fx, fy, cx, cy = config.intrinsics
         else:

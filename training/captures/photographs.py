@@ -1,8 +1,10 @@
 """Photographs alone and videos, which pycolmap registers: SIFT, matching, incremental mapping."""
 
 import shutil
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterator, Sequence
 from contextlib import closing
+from itertools import batched, combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,9 +15,9 @@ from PIL import ExifTags, Image
 from scipy.cluster.vq import kmeans2, vq
 
 from splatpilot.systems.common.processes import available_cores, run_in_subprocess
-from splatpilot.systems.common.progress import Progress, resumable
+from splatpilot.systems.common.progress import Progress, resumable, say
 from splatpilot.systems.common.validation import require
-from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture import Capture, SfmPoints
 from splatpilot.training.captures.capture_config import (
     CaptureConfig,
     cache_folder,
@@ -28,7 +30,7 @@ from splatpilot.training.captures.colmap import (
     mask_folder,
     open_model,
 )
-from splatpilot.training.captures.frames import IMAGE_SUFFIXES, image_size
+from splatpilot.training.captures.frames import IMAGE_SUFFIXES, image_header
 
 if TYPE_CHECKING:
     import pycolmap
@@ -46,6 +48,8 @@ _POSES = ("poses_bounds.npy", "cameras.xml")  # of LLFF, of Metashape
 _MIN_PHOTOGRAPHS = 3
 _SHARPNESS_WIDTH = 480  # [px], at which frames are compared
 _QUALITY = 97
+_OVERLAP, _FEATURES = 10, 2048  # of images to be matched, and maximum of an image
+_MIN_POINTS = 100  # that are triangulated
 
 
 def image_files(path: Path) -> list[Path]:
@@ -64,25 +68,21 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
     """Opens photographs without poses, registered by pycolmap; the cache keeps the registration. At
     least three, and half of them, must be registered. Registration keeps `config.intrinsics`."""
     files, dropped = [], []
-    if poses := [name for name in _POSES if (path / name).exists()]:
-        if config.kind != "photographs":
-            raise ValueError(
-                f"{path}: its poses in {poses[0]} are not read; convert them to COLMAP or "
-                "nerfstudio, or set capture.kind=photographs to register the images again"
-            )
+    poses = [name for name in _POSES if (path / name).exists()]
+    if poses and config.kind != "photographs":
+        raise ValueError(
+            f"{path}: its poses in {poses[0]} are not read; convert them to COLMAP or "
+            "nerfstudio, or set capture.kind=photographs to register the images again"
+        )
     found = image_files(path)
     if unreadable := [file for file in found if file.suffix.lower() in _UNREADABLE]:
         kinds = ", ".join(sorted({file.suffix[1:].upper() for file in unreadable}))
         dropped.append(
             f"{path}: {len(unreadable)} {kinds} images cannot be read; convert them to JPEG"
         )
-    for file in found:
-        if file in unreadable:
-            continue
+    for file in (each for each in found if each not in unreadable):
         try:
-            image_size(file)
-            with Image.open(file) as image:
-                is_depth = image.mode.startswith(("I", "F"))
+            is_depth = image_header(file)[1].startswith(("I", "F"))
             require(not is_depth, f"{file}", "a photograph", "depth, one number per pixel")
             files.append(file)
         except (ValueError, OSError) as error:
@@ -93,17 +93,16 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
         raise ValueError(f"{path}: readable photographs must be at least 3, got {len(files)}{why}")
     folder = files[0].parent
     names = [file.name for file in files]
-    for name in names:
-        valid = not any(map(str.isspace, name))  # which separates names in COLMAP's lists
-        require(valid, f"{folder}: names", "without spaces", repr(name), "rename the files")
+    for name in names:  # Spaces separate them in COLMAP's lists.
+        spaced = any(map(str.isspace, name))
+        require(not spaced, f"{folder}: names", "without spaces", repr(name), "rename the files")
     masks = sorted(file for file in mask_folder(folder).rglob("*") if file.is_file())
     version = import_pycolmap().__version__
     key = cache_key([*files, *masks], version, _MAX_SIZE, _SEED, config.partners, config.intrinsics)
 
     def register(written: Path) -> None:
         work = folder, names, _one_camera(files), config, written
-        kept = "nothing is kept of the registration; the same command starts again"
-        with resumable(lambda: kept):
+        with resumable(lambda: "nothing is kept of the registration; the same command repeats it"):
             run_in_subprocess(f"{path}: registration", _register, work)
 
     model = cached_folder(cache_folder(config, "photographs", key) / "model", register)
@@ -134,9 +133,8 @@ def _one_camera(files: list[Path]) -> bool:
 
 
 def _register(work: tuple[Path, list[str], bool, CaptureConfig, Path]) -> None:
-    """Writes the largest model of a folder's images, for `work`: the folder, names of images, true
-    for one camera, and the folder to write. Seeds are fixed and images are numbered in order, so
-    that threads do not change the result."""
+    """Writes the largest model. Seeds and the order of images are fixed, so that threads do not
+    change it."""
     folder, names, is_one_camera, config, written = work
     temporary = written / "work"
     temporary.mkdir()
@@ -153,7 +151,7 @@ def _register(work: tuple[Path, list[str], bool, CaptureConfig, Path]) -> None:
     pycolmap.import_images(database, folder, mode, names, reader)
     extraction = pycolmap.FeatureExtractionOptions(max_image_size=_MAX_SIZE, use_gpu=False)
     # Enlarging the image first finds more in small ones and takes four times as long.
-    small = max(max(image_size(folder / name)) for name in names) < _SMALL
+    small = max(max(image_header(folder / name)[0]) for name in names) < _SMALL
     extraction.sift.first_octave = -1 if small else 0
     if (masks := mask_folder(folder)).is_dir():
         reader.mask_path = masks
@@ -198,23 +196,23 @@ def _register(work: tuple[Path, list[str], bool, CaptureConfig, Path]) -> None:
 
 def _batches[Item](items: list[Item], size: int, what: str, unit: str) -> Iterator[list[Item]]:
     with Progress(total=len(items), desc=what, unit=unit) as progress:
-        for start in range(0, len(items), size):
-            yield items[start : start + size]
-            progress.update(len(items[start : start + size]))
+        for batch in batched(items, size):
+            yield list(batch)
+            progress.update(len(batch))
 
 
 def _pairs(database: Path, names: list[str], partners: int) -> list[tuple[int, int]]:
     if partners == 0:
         partners = len(names) if len(names) <= _MAX_EXHAUSTIVE else _PARTNERS
     if partners >= len(names) - 1:
-        return [(a, b) for a in range(len(names)) for b in range(a + 1, len(names))]
+        return list(combinations(range(len(names)), 2))
     with closing(import_pycolmap().Database.open(database)) as opened:
         return likely_pairs(similarity(opened, names), partners)
 
 
 def likely_pairs(similarity: NDArray[np.float64], partners: int) -> list[tuple[int, int]]:
-    """Returns pairs of each image with `partners` / 2 neighbors and those others whose `similarity`
-    (N, N) is largest, as indices, the smaller first, in order."""
+    """Returns sorted pairs of indices: each image with `partners` / 2 neighbors and those others
+    whose `similarity` (N, N) is largest."""
     count, near = len(similarity), max(1, partners // 4)  # on either side
     pairs = {(a, b) for a in range(count) for b in range(a + 1, min(a + near + 1, count))}
     others = similarity.copy()
@@ -229,9 +227,8 @@ def likely_pairs(similarity: NDArray[np.float64], partners: int) -> list[tuple[i
 
 
 def similarity(database: "pycolmap.Database", names: list[str]) -> NDArray[np.float64]:
-    """Returns the cosines (N, N) between images whose features a database holds. The difference of
-    each descriptor from the nearest of 32 words is summed to one vector per image (VLAD; Jegou et
-    al. 2010)."""
+    """Returns the cosines (N, N) between images of a database, each the sum of the differences of
+    its descriptors from the nearest of 32 words (VLAD; Jegou et al. 2010)."""
     numbers = {image.name: image.image_id for image in database.read_all_images()}
     features = []
     for name in names:
@@ -298,3 +295,77 @@ def _sharpness(frame: NDArray) -> float:
     size = width, max(1, frame.shape[0] * width // frame.shape[1])
     small = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), size, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(small, cv2.CV_32F).var())
+
+
+def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
+    """Triangulates points between frames of a capture by pycolmap, with the capture's poses. SIFT
+    features of each frame are matched with those of the next ten in order."""
+    with tempfile.TemporaryDirectory(prefix="splatpilot-") as folder:
+        images, masks = Path(folder) / "images", Path(folder) / "masks"
+        for each in (images, masks, Path(folder) / "model"):
+            each.mkdir()
+        poses = {}
+        for k, i in enumerate(Progress(numbers, "copying frames", unit="frame")):
+            name = f"{k:06d}.png"
+            valid = np.broadcast_to(capture.load_valid(i), (capture.height, capture.width))
+            files = {
+                images / name: cv2.cvtColor(capture.load_image(i), cv2.COLOR_RGB2BGR),
+                masks / f"{name}.png": 255 * valid.astype(np.uint8),
+            }
+            for file, pixels in files.items():
+                if not cv2.imwrite(str(file), pixels):
+                    raise OSError(f"{file}: cannot be written; is the disk full?")
+            poses[name] = capture.X_WCs[i].inverse().GetAsMatrix34()
+        say(f"triangulating points between {len(poses)} images")
+        work = Path(folder), capture.K, poses
+        p_WQ, colors = run_in_subprocess(f"{folder}: triangulation", _triangulate, work)
+    require(
+        len(p_WQ) >= _MIN_POINTS,
+        f"{capture.source}: the number of points between its images",
+        f"at least {_MIN_POINTS}",
+        len(p_WQ),
+        "it has too little texture or overlap",
+    )
+    # Threads process images in any order, and points are numbered by it.
+    order = np.lexsort(p_WQ.T)
+    return SfmPoints(p_WQ[order], colors[order])
+
+
+def _triangulate(
+    work: tuple[Path, NDArray[np.float64], dict[str, NDArray[np.float64]]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns points (n, 3) and colors (n, 3), 0 to 1, given the folder, K and X_CWs by name."""
+    folder, K, poses = work
+    pycolmap = import_pycolmap()
+    pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 2)
+    pycolmap.set_random_seed(0)
+    database, images = folder / "database.db", folder / "images"
+    # One thread each, for deterministic points.
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
+    extraction.sift.max_num_features = _FEATURES
+    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE", mask_path=folder / "masks")
+    reader.camera_params = ",".join(f"{x:.17g}" for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    pycolmap.extract_features(
+        database,
+        images,
+        list(poses),
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as content:
+        (camera,) = content.read_all_cameras()
+        model.add_camera_with_trivial_rig(camera)
+        for image in content.read_all_images():
+            posed = pycolmap.Image(image.name, camera_id=camera.camera_id, image_id=image.image_id)
+            model.add_image_with_trivial_frame(posed, pycolmap.Rigid3d(poses[image.name]))
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1)
+    pairing = pycolmap.SequentialPairingOptions(overlap=_OVERLAP, quadratic_overlap=False)
+    pycolmap.match_sequential(database, matching, pairing)
+    options = pycolmap.IncrementalPipelineOptions(extract_colors=True, num_threads=1, random_seed=0)
+    model = pycolmap.triangulate_points(model, database, images, folder / "model", options=options)
+    points = list(model.points3D.values())
+    p_WQ = np.array([point.xyz for point in points]).reshape(-1, 3)
+    return p_WQ, np.array([point.color for point in points]).reshape(-1, 3) / 255

@@ -1,9 +1,5 @@
-"""Refines poses so that depth and brightness of all frames agree.
-
-Poses of phones, KinectFusion and odometry drift by centimeters and degrees, and a reconstruction
-shows every surface twice. This is direct bundle adjustment of RGB-D frames (Kerl, Sturm and Cremers
-2013; Schops, Sattler and Pollefeys 2019), by Gauss-Newton, of all frames at once.
-"""
+"""Refines poses, which drift, so that depth and brightness of all frames agree: direct bundle
+adjustment by Gauss-Newton (Kerl, Sturm and Cremers 2013; Schops, Sattler and Pollefeys 2019)."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +13,6 @@ from scipy.sparse import coo_matrix, csc_matrix, eye, kron
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.progress import Progress, say
 from splatpilot.systems.common.validation import errors_about
 from splatpilot.training.captures.capture import (
@@ -32,7 +27,7 @@ from splatpilot.training.captures.capture_config import (
     CaptureConfig,
     cache_folder,
     cache_key,
-    prepare_cache,
+    cached_folder,
 )
 
 _WIDTH = 320  # [px] Approximate width of compared images, to which lengths in pixels below refer
@@ -92,9 +87,8 @@ class ComparedFrame:
     def sees(
         self, p_CQ: NDArray[np.float64], reach: float = _REACH
     ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-        """Returns which of the points (n, 3) are on surfaces that it sees, up to a relative
-        difference of depth; the image coordinates (2, n) of all; and its inverse depth there with
-        derivatives (3, n)."""
+        """Returns which of the points (n, 3) are on surfaces that it sees within `reach`; the image
+        coordinates (2, n) of all; and its inverse depth there with derivatives (3, n)."""
         x, y, z = p_CQ.T
         u = np.array(project(self.K, x, y, z.clip(min=1e-3)))
         inverse = _sample(self.inverse_depth, u)
@@ -123,8 +117,7 @@ def compare_frames(
     X_WC_other: RigidTransform,
     reach: float,
 ) -> Comparison | None:
-    """Compares the points of one frame with what another sees there, see `ComparedFrame.sees`; None
-    if fewer than fifty are on surfaces that it sees."""
+    """Compares the points of one frame with what another sees there; None if it sees too few."""
     R, p = X_WC_other.rotation().matrix(), X_WC_other.translation()
     p_WQ = one.p_CQ @ X_WC.rotation().matrix().T + X_WC.translation()
     q = (p_WQ - p) @ R
@@ -170,21 +163,16 @@ class RefinedPoses:
 
     def __str__(self) -> str:
         rotated = np.rad2deg(self.rotated)
-        lines = [f"poses moved by {self.moved:.3f} m and {rotated:.1f} degrees on average"]
-        for name in ("depth", "contrast"):
-            before, after = getattr(self, name)
-            lines.append(f"{name} differs between frames by {after:.2%}, before by {before:.2%}")
-        return "; ".join(lines)
+        text = f"poses moved by {self.moved:.3f} m and {rotated:.1f} degrees on average"
+        for name, (before, after) in (("depth", self.depth), ("contrast", self.contrast)):
+            text += f"; {name} differs between frames by {after:.2%}, before by {before:.2%}"
+        return text
 
 
 def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform]) -> RefinedPoses:
     """Returns the poses of frames in sequence with the smallest squared residuals over their
-    spreads, see `Comparison`.
-
-    This removes drift of centimeters and of a degree or two, not lost tracking: points whose depths
-    differ by more than 8 % are not compared. Robust weights as narrow as the noise of a sensor
-    would keep frames where they are.
-    """
+    spreads, see `Comparison`. Removes drift of centimeters and a degree or two, not lost tracking:
+    points whose depths differ by more than 8 % are not compared."""
     poses = given = list(X_WCs)
     pairs = _pairs(frames, poses)
     spreads = _SPREADS
@@ -199,8 +187,8 @@ def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform
             ]
             if not compared:
                 raise ValueError(
-                    "no two frames see the same surfaces, so poses cannot be refined; look at what "
-                    "`splatpilot capture check` says of them"
+                    "no two frames see the same surfaces, so poses cannot be refined; see "
+                    "`splatpilot capture check`"
                 )
             differences = [np.median(np.abs(found.residuals), axis=1) for _, _, found in compared]
             history.append(np.median(differences, axis=0))
@@ -222,31 +210,26 @@ def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform
 def _pairs(
     frames: Sequence[ComparedFrame], X_WCs: Sequence[RigidTransform]
 ) -> list[tuple[int, int]]:
-    """Returns pairs of each frame with frames that see it: most of the nearest in the sequence, and
-    fewer of those farther away."""
+    """Returns pairs of each frame with frames that see it, fewer of those farther in sequence."""
     X_CWs = np.array([X_WC.inverse().GetAsMatrix34() for X_WC in X_WCs])
+    height, width = frames[0].contrast.shape
     pairs = []
     for i in Progress(range(len(frames)), "comparing frames", unit="frame"):
         p_WQ = X_WCs[i].multiply(frames[i].p_CQ[:_PROBES].T)
         if p_WQ.size < 3 * _PROBES:
             continue
         p_CQs = X_CWs[:, :, :3] @ p_WQ + X_CWs[:, :, 3:]  # (N, 3, n)
+        x, y, z = np.moveaxis(frames[i].K @ p_CQs, -2, 0)
+        inside = (z > 0) & (x > 0) & (x < width * z) & (y > 0) & (y < height * z)
         seeing = [
             j
-            for j in np.flatnonzero(_inside(frames[i], p_CQs).mean(axis=1) > _OVERLAP).tolist()
+            for j in np.flatnonzero(inside.mean(axis=1) > _OVERLAP).tolist()
             if j != i and frames[j].sees(p_CQs[j].T)[0].mean() > _OVERLAP
         ]
         seeing.sort(key=lambda j: abs(j - i))
         ranks = np.geomspace(1, max(len(seeing), 1), _PARTNERS).round().astype(int)
         pairs += [(i, seeing[rank - 1]) for rank in np.unique(ranks) if seeing]
     return pairs
-
-
-def _inside(frame: ComparedFrame, p_CQs: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Returns which points p_CQ (..., 3, n) fall into the image of a frame, (..., n)."""
-    height, width = frame.contrast.shape
-    x, y, z = np.moveaxis(frame.K @ p_CQs, -2, 0)
-    return (z > 0) & (x > 0) & (x < width * z) & (y > 0) & (y < height * z)
 
 
 def _step(
@@ -300,16 +283,18 @@ def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capt
     key = cache_key(
         filter(Path.is_file, files), _VERSION, np.__version__, capture.camera_digest(), settings
     )
-    file = cache_folder(config, "poses") / f"poses-{key}.npy"
-    if not file.is_file():
-        prepare_cache(file.parent)
+
+    def write(folder: Path) -> None:
         factor = shrink_factor(capture.width, _WIDTH)
-        numbers = Progress(range(len(capture)), "loading frames", unit="frame")
-        frames = [ComparedFrame.prepare(shrink(capture.frame(i), factor)) for i in numbers]
+        loaded = Progress(capture.frames(), "loading frames", len(capture), unit="frame")
+        frames = [ComparedFrame.prepare(shrink(frame, factor)) for frame in loaded]
         with errors_about(path):
             refined = refine_poses(frames, capture.X_WCs)
         say(f"{path}: {refined}")
-        with written_atomically(file) as written, written.open("wb") as stream:
-            np.save(stream, np.array([X_WC.GetAsMatrix34() for X_WC in refined.X_WCs]))
-    X_WCs = [RigidTransform(RotationMatrix(X[:, :3]), X[:, 3]) for X in np.load(file)]
+        np.save(folder / "poses.npy", [X_WC.GetAsMatrix34() for X_WC in refined.X_WCs])
+
+    folder = cached_folder(cache_folder(config, "poses", key), write)
+    X_WCs = [
+        RigidTransform(RotationMatrix(X[:, :3]), X[:, 3]) for X in np.load(folder / "poses.npy")
+    ]
     return replace(capture, X_WCs=X_WCs)

@@ -13,7 +13,8 @@ from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios
-from splatpilot.diagrams.worlds.mesh import check_mesh, mesh_digests, mesh_distance, suitable_voxel
+from splatpilot.diagrams.worlds.building_blocks import suitable_voxel
+from splatpilot.diagrams.worlds.mesh import check_mesh, mesh_digests, mesh_distance
 from splatpilot.diagrams.worlds.mesh_renderer import MeshRenderer
 from splatpilot.diagrams.worlds.splits import check_split, choose_split, part_digests, source_digest
 from splatpilot.diagrams.worlds.world_gltf import write_gltf

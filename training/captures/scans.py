@@ -193,7 +193,7 @@ def _read_keyframe(
         focal = intrinsics or [float(values[name]) for name in ("fx", "fy", "cx", "cy")]
         source = "capture.intrinsics" if intrinsics else f"{camera.parent.name}/"
         if "width" not in values:  # as in newer corrected cameras
-            values["width"], values["height"] = frames.image_size(image)
+            values["width"], values["height"] = frames.image_header(image)[0]
         lens = Lens(pinhole(*focal), int(values["width"]), int(values["height"]), source=source)
         matrix = [float(values[f"t_{row}{column}"]) for row in range(3) for column in range(4)]
     return lens, np.array(matrix).reshape(3, 4)

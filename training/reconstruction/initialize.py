@@ -1,9 +1,7 @@
 """Initial Gaussians of a reconstruction: from depth, from points, or random."""
 
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,14 +9,13 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.common.processes import run_in_subprocess
 from splatpilot.systems.common.progress import Progress, say
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import FAR
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.training.captures.capture import Capture, CaptureFrame, SfmPoints
-from splatpilot.training.captures.colmap import import_pycolmap
+from splatpilot.training.captures.capture import Capture, CaptureFrame
+from splatpilot.training.captures.photographs import triangulate
 from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
 from splatpilot.training.reconstruction.photometry import (
     Photometry,
@@ -52,8 +49,6 @@ _BEHIND = 0.1  # relative difference of depth, above which another surface shows
 _POINT_OPACITY, _POINT_SIZE = 0.1, 0.5  # size relative to the distance of the three closest others
 _RANDOM_DEPTH = (0.1, 10.0)  # in extents of the cameras
 _MAX_FROM_DEPTH, _MAX_ADDED, _RANDOM = 1_000_000, 180_000, 120_000  # numbers of Gaussians
-_OVERLAP, _FEATURES = 10, 2048  # of images to be matched, and maximum of an image
-_MIN_POINTS = 100  # that are triangulated
 
 
 @dataclass(frozen=True, eq=False)
@@ -417,83 +412,3 @@ def random_points(
         points.append(frame.X_WC.multiply(frame.back_project(u, v, z).T).T)
         colors.append(frame.image[v.astype(int), u.astype(int)] / 255)
     return np.concatenate(points)[:count], np.concatenate(colors)[:count]
-
-
-def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
-    """Triangulates points between frames of a capture by pycolmap, with the capture's poses. SIFT
-    features of each frame are matched with those of the next ten in order."""
-    with tempfile.TemporaryDirectory(prefix="splatpilot-") as folder:
-        images, masks = Path(folder) / "images", Path(folder) / "masks"
-        images.mkdir()
-        masks.mkdir()
-        poses = {}
-        for k, i in enumerate(Progress(numbers, "copying frames", unit="frame")):
-            name = f"{k:06d}.png"
-            valid = np.broadcast_to(capture.load_valid(i), (capture.height, capture.width))
-            files = {
-                images / name: cv2.cvtColor(capture.load_image(i), cv2.COLOR_RGB2BGR),
-                masks / f"{name}.png": 255 * valid.astype(np.uint8),
-            }
-            for file, pixels in files.items():
-                if not cv2.imwrite(str(file), pixels):
-                    raise OSError(f"{file}: cannot be written; is the disk full?")
-            poses[name] = capture.X_WCs[i].inverse().GetAsMatrix34()
-        say(f"triangulating points between {len(poses)} images")
-        work = Path(folder), capture.K, poses
-        p_WQ, colors = run_in_subprocess(f"{folder}: triangulation", _triangulate, work)
-    require(
-        len(p_WQ) >= _MIN_POINTS,
-        f"{capture.source}: the number of points between its images",
-        f"at least {_MIN_POINTS}",
-        len(p_WQ),
-        "it has too little texture or overlap",
-    )
-    # Threads process images in any order, and points are numbered by it.
-    order = np.lexsort(p_WQ.T)
-    return SfmPoints(p_WQ[order], colors[order])
-
-
-def _triangulate(
-    work: tuple[Path, NDArray[np.float64], dict[str, NDArray[np.float64]]],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns points (n, 3) and their colors (n, 3), 0 to 1. `work` is the folder of `images` and
-    `masks`, K (3, 3) [px], and poses X_CW (3, 4) by name."""
-    folder, K, poses = work
-    pycolmap = import_pycolmap()
-    pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 2)
-    pycolmap.set_random_seed(0)
-    database, images = folder / "database.db", folder / "images"
-    # One thread each, for deterministic points.
-    extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
-    extraction.sift.max_num_features = _FEATURES
-    parameters = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    reader = pycolmap.ImageReaderOptions(
-        camera_model="PINHOLE",
-        camera_params=",".join(f"{x:.17g}" for x in parameters),
-        mask_path=folder / "masks",
-    )
-    pycolmap.extract_features(
-        database,
-        images,
-        list(poses),
-        camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=reader,
-        extraction_options=extraction,
-        device=pycolmap.Device.cpu,
-    )
-    model = pycolmap.Reconstruction()
-    with pycolmap.Database.open(database) as content:
-        (camera,) = content.read_all_cameras()
-        model.add_camera_with_trivial_rig(camera)
-        for image in content.read_all_images():
-            posed = pycolmap.Image(image.name, camera_id=camera.camera_id, image_id=image.image_id)
-            model.add_image_with_trivial_frame(posed, pycolmap.Rigid3d(poses[image.name]))
-    matching = pycolmap.FeatureMatchingOptions(num_threads=1)
-    pairing = pycolmap.SequentialPairingOptions(overlap=_OVERLAP, quadratic_overlap=False)
-    pycolmap.match_sequential(database, matching, pairing)
-    (folder / "model").mkdir()
-    options = pycolmap.IncrementalPipelineOptions(extract_colors=True, num_threads=1, random_seed=0)
-    model = pycolmap.triangulate_points(model, database, images, folder / "model", options=options)
-    points = list(model.points3D.values())
-    p_WQ = np.array([point.xyz for point in points]).reshape(-1, 3)
-    return p_WQ, np.array([point.color for point in points]).reshape(-1, 3) / 255

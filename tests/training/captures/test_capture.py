@@ -124,8 +124,8 @@ def test_cache_folder_is_made_where_it_can_be_written(tmp_path, monkeypatch):
     assert folder(default, "bags", "a") == tmp_path / "splatpilot/bags/a"
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert folder(default, "bags") == Path.home() / ".cache/splatpilot/bags"
-    capture_config.prepare_cache(tmp_path / "made/deep")
-    assert (tmp_path / "made/deep").is_dir()
+    made = capture_config.cached_folder(tmp_path / "made/deep", lambda written: None)
+    assert made.is_dir()
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=r"file/deep: cannot be written .*; set capture\.cache to"):
-        capture_config.prepare_cache(tmp_path / "file/deep")
+        capture_config.cached_folder(tmp_path / "file/deep/a", lambda written: None)

@@ -1,14 +1,18 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pycolmap
 import pytest
+from pydrake.math import RigidTransform, RotationMatrix
 from room import tiled_flight
 
 from splatpilot.training.captures import frames as image_files
-from splatpilot.training.captures import photographs as video
+from splatpilot.training.captures import photographs
+from splatpilot.training.captures.capture import Capture, pixel_rays, project_points
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.photographs import import_pycolmap, likely_pairs, similarity
+from splatpilot.training.captures.photographs import likely_pairs, similarity, triangulate
 
 
 @pytest.mark.parametrize("partners", [4, 8])
@@ -26,7 +30,6 @@ def test_likely_pairs(partners):
 
 
 def test_features_of_a_database(tmp_path):
-    pycolmap = import_pycolmap()
     rng = np.random.default_rng(2)
     scenes = [
         cv2.resize(rng.integers(0, 255, (60, 80), dtype=np.uint8), (320, 240)) for _ in range(2)
@@ -69,7 +72,7 @@ def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path, monkeypatch):
         registered.update({file.name: file for file in sorted(path.iterdir())})
         raise ValueError(f"{path}: enough")
 
-    monkeypatch.setattr(video, "read_photographs", read)
+    monkeypatch.setattr(photographs, "read_photographs", read)
     made = write_video(tmp_path / "flight.mp4", 60, sharp={3, 29, 30, 50})
     config = CaptureConfig(cache=str(tmp_path / "cache"))
     for _ in range(2):  # at the default rate of 2 Hz
@@ -136,5 +139,48 @@ def test_registration_keeps_given_intrinsics_and_is_cached(tmp_path, monkeypatch
     model = next((tmp_path / "cache").rglob("cameras.bin")).parent
     [camera] = pycolmap.Reconstruction(model).cameras.values()
     assert camera.params.tolist() == config.intrinsics
-    monkeypatch.setattr(video, "_register", None)
+    monkeypatch.setattr(photographs, "_register", None)
     assert len(read_capture(tmp_path, config)) == 8
+
+
+POSTER_K = np.array([[140.0, 0, 80], [0, 140.0, 60], [0, 0, 1]])
+
+
+def posters() -> Capture:
+    """Four views of a textured plane at z = 2 m, from cameras that slide along it."""
+    rng = np.random.default_rng(0)
+    texture = rng.uniform(0, 255, (120, 160, 3)).astype(np.float32)  # 2.5 cm a texel
+    R_WCs = [RotationMatrix.MakeYRotation(-0.05 * i) for i in range(4)]
+    X_WCs = [RigidTransform(R, [0.12 * i, 0.03 * i, 0.0]) for i, R in enumerate(R_WCs)]
+
+    def load_image(i: int) -> np.ndarray:
+        rays = pixel_rays(POSTER_K, 160, 120) @ R_WCs[i].matrix().T
+        p_WQ = X_WCs[i].translation() + 2.0 * rays / rays[..., 2:]
+        u, v = np.moveaxis(((p_WQ[..., :2] + [1.6, 1.4]) / 0.025).astype(np.float32), -1, 0)
+        return cv2.remap(texture, u, v, cv2.INTER_LINEAR).astype(np.uint8)
+
+    return Capture("posters", "four posters", POSTER_K, 160, 120, X_WCs, load_image)
+
+
+def test_triangulated_points_lie_on_the_plane(monkeypatch):
+    capture, loaded = posters(), []
+
+    def load_image(i: int) -> np.ndarray:
+        loaded.append(i)
+        return capture.load_image(i)
+
+    watched = replace(capture, load_image=load_image)
+    points, again = (triangulate(watched, [0, 1, 3]) for _ in "ab")
+    np.testing.assert_array_equal(points.p_WQ, again.p_WQ)
+    assert loaded == [0, 1, 3] * 2
+    x, y, z = points.p_WQ.T
+    assert len(z) >= 100
+    assert np.median(np.abs(z - 2.0)) < 0.01
+    assert np.ptp(x) > 1.5 and np.ptp(y) > 1.0
+    inside, v, u = project_points(POSTER_K, points.p_WQ, 160, 120)
+    difference = np.abs(points.colors[inside] - capture.load_image(0)[v, u] / 255)
+    assert np.median(difference) < 0.1
+    few = np.zeros((99, 3)), np.zeros((99, 3))
+    monkeypatch.setattr(photographs, "run_in_subprocess", lambda *_: few)
+    with pytest.raises(ValueError, match="points between its images must be at least 100, got 99"):
+        triangulate(capture, [0, 1])

@@ -1,7 +1,6 @@
 import re
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import Quaternion
@@ -228,45 +227,6 @@ def test_underlay_lies_behind_and_closes_gaps():
     np.testing.assert_allclose(widths[surface].mean(), 0.4 * 4 * 2 / (10 * F), rtol=0.01)
     np.testing.assert_allclose(widths[under].mean(), 0.6 * 8 * 2.06 / (10 * F), rtol=0.01)
     np.testing.assert_allclose(colors, 0.5)
-
-
-POSTER_K = np.array([[140.0, 0, 80], [0, 140.0, 60], [0, 0, 1]])
-
-
-def posters() -> Capture:
-    """Four views of a textured plane at z = 2 m, from cameras that slide along it."""
-    rng = np.random.default_rng(0)
-    texture = rng.uniform(0, 255, (120, 160, 3)).astype(np.float32)  # 2.5 cm a texel
-    R_WCs = [RotationMatrix.MakeYRotation(-0.05 * i) for i in range(4)]
-    X_WCs = [RigidTransform(R, [0.12 * i, 0.03 * i, 0.0]) for i, R in enumerate(R_WCs)]
-
-    def load_image(i: int) -> np.ndarray:
-        rays = pixel_rays(POSTER_K, 160, 120) @ R_WCs[i].matrix().T
-        p_WQ = X_WCs[i].translation() + 2.0 * rays / rays[..., 2:]
-        u, v = np.moveaxis(((p_WQ[..., :2] + [1.6, 1.4]) / 0.025).astype(np.float32), -1, 0)
-        return cv2.remap(texture, u, v, cv2.INTER_LINEAR).astype(np.uint8)
-
-    return Capture("posters", "four posters", POSTER_K, 160, 120, X_WCs, load_image)
-
-
-def test_triangulated_points_lie_on_the_plane():
-    capture, loaded = posters(), []
-
-    def load_image(i: int) -> np.ndarray:
-        loaded.append(i)
-        return capture.load_image(i)
-
-    watched = replace(capture, load_image=load_image)
-    points, again = (initialize.triangulate(watched, [0, 1, 3]) for _ in "ab")
-    np.testing.assert_array_equal(points.p_WQ, again.p_WQ)
-    assert loaded == [0, 1, 3] * 2
-    x, y, z = points.p_WQ.T
-    assert len(z) >= 100
-    assert np.median(np.abs(z - 2.0)) < 0.01
-    assert np.ptp(x) > 1.5 and np.ptp(y) > 1.0
-    inside, v, u = project_points(POSTER_K, points.p_WQ, 160, 120)
-    difference = np.abs(points.colors[inside] - capture.load_image(0)[v, u] / 255)
-    assert np.median(difference) < 0.1
 
 
 def test_gaussians_to_optimize_cover_all_that_the_frames_show(capture):

@@ -86,8 +86,6 @@ def test_gaussians_are_added_only_without_depth(tmp_path, room):
     assert count(initialization="random") > 300
     assert count(initialization="random", strategy="none") == 300
     assert count() == count(strategy="none")
-    with pytest.raises(ValueError, match="number of points between its images must be at least"):
-        count(initialization="points")
 
 
 def test_depth_term_moves_gaussians_to_surfaces(tmp_path, room):
