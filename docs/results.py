@@ -21,7 +21,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from datetime import date
 from functools import cache
@@ -39,11 +39,13 @@ from splatpilot.analysis.benchmark.tables import (
     PAPER,
     PAPER_FLIGHTS,
     cluster_interval,
+    select,
     wilson_interval,
 )
 from splatpilot.analysis.reconstruction.fidelity import band
 from splatpilot.analysis.twin import predictions
 from splatpilot.diagrams.scenarios import benchmark_scenarios
+from splatpilot.systems.common.files import write_csv
 from splatpilot.systems.common.provenance import describe_seeds
 
 ROOT = Path(__file__).parents[1]
@@ -63,55 +65,38 @@ _SUMS = {"clearance_sum_m": "min_clearance_m", "speed_sum_m_s": "mean_speed_m_s"
 """Columns with sums over feasible flights, by column of `rollouts.csv`."""
 
 
-def keep(study: Path, name: str) -> None:
+def keep(study: str, name: str) -> None:
     """Stores the results of a study as `name`."""
-    folder = StudyFolder(study)
-    config = folder.config()
-    groups: dict[tuple[str, str, str], list[dict[str, str]]] = {}
-    with (study / "rollouts.csv").open() as file:
-        for row in csv.DictReader(file):
-            groups.setdefault((row["policy"], row["speed"], row["scenario"]), []).append(row)
-    rows = []
-    for (policy, speed, scenario), flights in groups.items():
-        row: dict[str, Any] = {"policy": policy, "speed": speed, "scenario": scenario}
+    folder, rows = StudyFolder(Path(study)), []
+    config, flown = folder.config(), read_rows(folder.path / "rollouts.csv")
+    key = "policy", "speed", "scenario"
+    for values in dict.fromkeys(tuple(row[column] for column in key) for row in flown):
+        row: Row = dict(zip(key, values, strict=True))
+        flights = select(flown, **row)
         row |= {"flights": len(flights), "successes": sum(f["success"] == "True" for f in flights)}
         row |= {outcome: sum(f["outcome"] == outcome for f in flights) for outcome in _OUTCOMES}
         for sum_name, column in _SUMS.items():
             row[sum_name] = f"{sum(float(f[column]) for f in flights if f[column]):.4f}"
         rows.append(row)
-    RESULTS.mkdir(exist_ok=True)
-    with (RESULTS / f"{name}.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
     timing = folder.read_timing(config.rollouts()[0].id)
-    flown = max(path.stat().st_mtime for path in (study / "rollouts").glob("*.npz"))
     about = {
         "split": config.split,
         "seeds": config.seeds,
-        "date": date.fromtimestamp(flown).isoformat(),
+        "date": max(map(_date, (folder.path / "rollouts").glob("*.npz"))),
         "machine": f"{_processor()}, kernels for {timing['simd']}",
         "command": _command(config),
         "program": folder.program(),
     }
-    (RESULTS / f"{name}.yaml").write_text(yaml.safe_dump(about, sort_keys=False, width=1000))
+    _store(name, rows, about)
 
 
-def keep_realism(folders: Sequence[Path]) -> None:
+def keep_realism(*folders: str) -> None:
     """Stores the results of `splatpilot.analysis.realism`, of different policies in each folder."""
-    rows = [
-        row
-        for folder in folders
-        for row in csv.DictReader((folder / "realism.csv").read_text().splitlines())
-    ]
+    rows = [row for folder in folders for row in read_rows(Path(folder) / "realism.csv")]
     order = list(dict.fromkeys(row["conditions"] for row in rows))
     rows.sort(key=lambda row: order.index(row["conditions"]))
-    with (RESULTS / "realism.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
     commands, programs = [], set[str]()
-    for folder in folders:
+    for folder in map(Path, folders):
         ideal = StudyFolder(folder / "ideal")
         config, effects = ideal.config(), folder.glob("*/study.yaml")
         fewest = min(StudyFolder(path.parent).config().seeds for path in effects)
@@ -120,10 +105,23 @@ def keep_realism(folders: Sequence[Path]) -> None:
         commands.append(f"{command} --effect-seeds {fewest}")
         programs.add(ideal.program()["splatpilot"])
     (program,) = programs
-    flown = (folders[0] / "realism.csv").stat().st_mtime
-    about = {"command": "; ".join(commands), "date": date.fromtimestamp(flown).isoformat()}
-    about |= {"program": program}
-    (RESULTS / "realism.yaml").write_text(yaml.safe_dump(about, sort_keys=False))
+    about = {"command": "; ".join(commands), "date": _date(Path(folders[0]) / "realism.csv")}
+    _store("realism", rows, about | {"program": program})
+
+
+def read_rows(file: Path) -> list[dict[str, str]]:
+    """Reads the rows of a CSV file."""
+    return list(csv.DictReader(file.read_text().splitlines()))
+
+
+def _store(name: str, rows: list[Row], about: dict[str, Any]) -> None:
+    RESULTS.mkdir(exist_ok=True)
+    write_csv(RESULTS / f"{name}.csv", rows)
+    (RESULTS / f"{name}.yaml").write_text(yaml.safe_dump(about, sort_keys=False, width=1000))
+
+
+def _date(file: Path) -> str:
+    return date.fromtimestamp(file.stat().st_mtime).isoformat()
 
 
 def _processor() -> str:
@@ -152,21 +150,16 @@ class Results(NamedTuple):
         """Reads or computes the results `name`; "study" is the study of the report."""
         name = STUDY if name == "study" else name
         if name in DERIVED:
-            rows = list(DERIVED[name]())
+            compute, source = DERIVED[name]
+            rows = list(compute(cls.read(source).rows if source else []))
         else:
-            with (RESULTS / f"{name}.csv").open() as file:
-                texts = list(csv.DictReader(file))
+            texts = read_rows(RESULTS / f"{name}.csv")
             rows = [{key: _number(text) for key, text in row.items()} for row in texts]
         return cls(rows, _about(name))
 
     @property
     def scenarios(self) -> list[str]:
         return list(dict.fromkeys(row["scenario"] for row in self.rows))
-
-    @property
-    def entries(self) -> list[tuple[str, float]]:
-        """Pairs of policy and speed."""
-        return list(dict.fromkeys((row["policy"], row["speed"]) for row in self.rows))
 
     def description(self) -> str:
         """Describes seeds, date, program, machine and command in Markdown."""
@@ -198,21 +191,11 @@ def _program(about: dict[str, Any]) -> str:
     return revision[:7] + revision[40:] if re.match(r"[0-9a-f]{40}", revision) else revision
 
 
-def success() -> Iterable[Row]:
-    """Yields the success of each policy and speed of the report's study."""
-    return success_rows(Results.read("study"))
-
-
-def density_policies() -> Iterable[Row]:
-    """Yields the success of each policy and speed in RAPID's forests."""
-    return success_rows(Results.read("density"))
-
-
-def success_rows(results: Results) -> Iterable[Row]:
+def success_rows(results: list[Row]) -> Iterable[Row]:
     """Yields success rates with intervals, and means over feasible flights, by policy and speed;
     and the paper's."""
-    for policy, speed in results.entries:
-        rows = [row for row in results.rows if (row["policy"], row["speed"]) == (policy, speed)]
+    for policy, speed in dict.fromkeys((row["policy"], row["speed"]) for row in results):
+        rows = select(results, policy=policy, speed=speed)
         counts = [(row["successes"], row["flights"]) for row in rows]
         successes, flights = total(rows, "successes"), total(rows, "flights")
         these = wilson_interval(successes, flights)
@@ -248,9 +231,8 @@ def _paper_row(policy: str) -> Row:
     return {f"paper_{name}": value for name, value in row.items()}
 
 
-def twins() -> Iterable[Row]:
+def twins(pairs: list[Row]) -> Iterable[Row]:
     """Yields the agreement of flights in scenes and meshes, by environment and of all."""
-    pairs = Results.read("twin_flights").rows
     for row in predictions(pairs):
         these = [pair for pair in pairs if row["environment"] in (pair["environment"], "all")]
         gaps = [
@@ -265,20 +247,18 @@ def twins() -> Iterable[Row]:
         }
 
 
-def twin_policies() -> Iterable[Row]:
+def twin_policies(pairs: list[Row]) -> Iterable[Row]:
     """Yields each policy's success in meshes and scenes."""
-    pairs = Results.read("twin_flights").rows
     for policy in dict.fromkeys(pair["policy"] for pair in pairs):
-        these = [pair for pair in pairs if pair["policy"] == policy]
+        these = select(pairs, policy=policy)
         rates = {kind: total(these, kind) / len(these) for kind in ("mesh", "splat")}
         yield {"policy": policy, "flights": len(these), **rates}
 
 
-def off_path() -> Iterable[Row]:
+def off_path(views: list[Row]) -> Iterable[Row]:
     """Yields medians and percentiles 10 and 90 of views off the path, by scene and offset."""
-    views = Results.read("off_path_views").rows
     for scene in dict.fromkeys(view["scene"] for view in views):
-        these = [view for view in views if view["scene"] == scene]
+        these = select(views, scene=scene)
         offsets = [view["offset"] for view in these]
         metrics = "psnr_db", "depth_mae_m", "depth_relative"
         bands = {name: band(offsets, [view[name] for view in these]) for name in metrics}
@@ -290,7 +270,7 @@ def off_path() -> Iterable[Row]:
             yield row
 
 
-def trainings() -> Iterable[Row]:
+def trainings(_: list[Row]) -> Iterable[Row]:
     """Yields seed, minutes and program of the training of the weights, from their cards."""
     for card in sorted((ROOT / "systems" / "policies" / "weights").glob("*.md")):
         text = " ".join(card.read_text().split())
@@ -302,34 +282,30 @@ def trainings() -> Iterable[Row]:
         }
 
 
-def sources() -> Iterable[Row]:
+def sources(_: list[Row]) -> Iterable[Row]:
     """Yields command, date, machine and program of the results in the report."""
     shown: list[str] = re.findall(
         r"<!-- (?:table \w+|value) (\w+)", (REPORT / "index.md").read_text()
     )
     shown += report_figures.FIGURES.values()
-    for name in sorted({_INPUTS.get(name, name) for name in shown}):
-        if name not in DERIVED:
+    inputs = {"study": STUDY} | {name: source for name, (_, source) in DERIVED.items()}
+    for name in sorted({inputs.get(name, name) for name in shown}):
+        if name:
             about = Results.read(name).about
             row = {key: about.get(key, "") for key in ("command", "date", "machine")}
             yield {"file": f"{name}.csv", **row, "program": _program(about)}
 
 
-DERIVED: dict[str, Callable[[], Iterable[Row]]] = {
-    each.__name__: each
-    for each in (success, density_policies, twins, twin_policies, off_path, trainings, sources)
+DERIVED: dict[str, tuple[Callable[[list[Row]], Iterable[Row]], str]] = {
+    "success": (success_rows, STUDY),
+    "density_policies": (success_rows, "density"),
+    "twins": (twins, "twin_flights"),
+    "twin_policies": (twin_policies, "twin_flights"),
+    "off_path": (off_path, "off_path_views"),
+    "trainings": (trainings, ""),
+    "sources": (sources, ""),
 }
-"""Results that are computed from others."""
-
-_INPUTS = {
-    "study": STUDY,
-    "success": STUDY,
-    "density_policies": "density",
-    "twins": "twin_flights",
-    "twin_policies": "twin_flights",
-    "off_path": "off_path_views",
-}
-"""The files that results in the report are computed from."""
+"""Results that are computed from other results, and the name of these."""
 
 
 def total(rows: list[Row], column: str) -> Any:
@@ -353,13 +329,13 @@ def columns(results: Results) -> str:
 
 
 def policies(results: Results) -> str:
-    rows = list(success_rows(results))
+    rows = list(success_rows(results.rows))
     return f"{results.description()}\n{columns(Results(rows, _about('policies')))}"
 
 
 def paper(results: Results) -> str:
     """Renders the paper's Table I next to our policies, and names scenarios that did not fly."""
-    ours = [row for row in success_rows(results) if row["policy"] in PAPER]
+    ours = [row for row in success_rows(results.rows) if row["policy"] in PAPER]
     others = [name for name in PAPER if name not in [row["policy"] for row in ours]]
     rendered = columns(Results([*ours, *map(_paper_row, others)], _about("paper")))
     missing = sorted(set(benchmark_scenarios()) - set(results.scenarios))
@@ -395,9 +371,8 @@ def realism(results: Results) -> str:
 def rates(results: Results) -> str:
     """Renders success rates with intervals as a sentence."""
     form = "`{policy}` {rate:.0%} ({low:.0%} to {high:.0%})"
-    found = "; ".join(cell(form, row) for row in success_rows(results))
-    about = results.about
-    seeds = describe_seeds(about["split"], about["seeds"])
+    found = "; ".join(cell(form, row) for row in success_rows(results.rows))
+    seeds = describe_seeds(results.about["split"], results.about["seeds"])
     return f"Success in {len(results.scenarios)} scenarios, {seeds}: {found}."
 
 
@@ -465,15 +440,11 @@ def report_digest() -> bytes:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("write", help=write.__doc__)
-    commands.add_parser("pdf", help=pdf.__doc__)
-    keep_parser = commands.add_parser("keep", help=keep.__doc__)
-    keep_parser.add_argument("study", type=Path)
-    keep_parser.add_argument("name")
-    realism_parser = commands.add_parser("keep_realism", help=keep_realism.__doc__)
-    realism_parser.add_argument("folders", type=Path, nargs="+")
-    options = vars(parser.parse_args())
-    known = {"keep": keep, "keep_realism": keep_realism, "write": write, "pdf": pdf}
-    known[options.pop("command")](**options)
+    known: dict[str, Callable[..., None]] = {
+        each.__name__: each for each in (keep, keep_realism, write, pdf)
+    }
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("`docs/")[0])
+    parser.add_argument("command", choices=known)
+    parser.add_argument("arguments", nargs="*", help="STUDY NAME, or FOLDER...")
+    options = parser.parse_args()
+    known[options.command](*options.arguments)

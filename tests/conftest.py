@@ -12,6 +12,7 @@ from splatpilot.diagrams.flight.sensors import SENSORS
 from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.extras import require_opengl
 from splatpilot.systems.messaging.lcm_ports import open_lcm
+from splatpilot.systems.visualization.live import RATE_SLIDER, LiveControls
 
 # Without tqdm's own thread, in which garbage may be collected: Drake aborts the process where a
 # Meshcat is freed by another thread than the one that made it.
@@ -63,10 +64,25 @@ def udp_url() -> str:
 
 
 @pytest.fixture
-def hedgehop(monkeypatch) -> Iterator[None]:
-    """Makes the example package importable; forgets its modules and entries afterwards."""
+def viewer(monkeypatch) -> None:
+    """Opens the pages of live flights, and flies them as fast as possible."""
+
+    def open_page(controls: LiveControls) -> None:
+        controls._meshcat.SetSliderValue(RATE_SLIDER, 0.0)
+
+    monkeypatch.setattr(LiveControls, "wait_for_viewer", open_page)
+
+
+@pytest.fixture
+def registered(monkeypatch) -> None:
+    """Forgets policies, sensors and worlds that a test registers."""
     for registry in (POLICIES, SENSORS, WORLDS):
         monkeypatch.setattr(registry, "_entries", dict(registry._entries))
+
+
+@pytest.fixture
+def hedgehop(registered, monkeypatch) -> Iterator[None]:
+    """Makes the example package importable; forgets its modules and entries afterwards."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "examples" / "hedgehop"))
     yield
     for name in [name for name in sys.modules if name.partition(".")[0] == "hedgehop"]:

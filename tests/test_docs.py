@@ -111,9 +111,7 @@ def test_files_are_configurations(page, tmp_path):
 @pytest.mark.parametrize(
     "page", [p for p in GUIDES if blocks(p, "python")], ids=lambda page: page.stem
 )
-def test_python_runs(page, monkeypatch):
-    monkeypatch.setattr(sp.LiveControls, "wait_for_viewer", lambda self: None)
-    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
+def test_python_runs(page, viewer, registered):
     names: dict[str, Any] = {"__name__": "__main__"}
     for code in blocks(page, "python"):
         exec(code, names)
@@ -121,10 +119,9 @@ def test_python_runs(page, monkeypatch):
         assert names["flight"].summary()["outcome"] in ("goal", "collision")
 
 
-def test_trained_models_fly_as_the_page_says(tmp_path, monkeypatch):
+def test_trained_models_fly_as_the_page_says(tmp_path, monkeypatch, registered):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
     [code] = (each for each in blocks(DOCS / "gym.md", "python") if "GymPolicy" in each)
     Path("my_ppo.py").write_text(code)
     world = sp.load_config(sp.Scenario(), overrides=["world.length=9"])
@@ -260,13 +257,12 @@ def test_site_builds(tmp_path):
     assert "https://" not in re.sub(r'href="[^"]*"', "", (tmp_path / "index.html").read_text())
 
 
-def test_python_of_the_readme_runs(tmp_path, monkeypatch, capsys):
+def test_python_of_the_readme_runs(tmp_path, monkeypatch, registered, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
     policy, flight, training = blocks(README, "python")
     for text, small in (
-        ("Env(16, ", "Env(1, "),
+        ("Env(16, scenario, num_worlds=4", "Env(1, scenario, num_worlds=1"),
         ("n_steps=64", "n_steps=2"),
         ("200_000", "2"),
         ("progress_bar=True", "progress_bar=False"),  # which needs rich

@@ -8,7 +8,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,6 @@ from typing import Any
 import pytest
 
 from splatpilot.analysis.commands.main import main
-from splatpilot.diagrams.flight.policies import POLICIES
-from splatpilot.systems.visualization.live import LiveControls
 
 ROOT = Path(__file__).parents[1]
 TUTORIALS = ROOT / "docs" / "tutorials"
@@ -48,7 +45,7 @@ SMALLER = {
         "spacing=0.5": "spacing=1",
         "36_left": "18_left",
         "width=400 --set height=300": "width=280 --set height=210",
-        "iterations=2000": "iterations=50 --set voxel_size=0.1",
+        "iterations=2000": "iterations=50 --set voxel_size=0.1 --set lpips_weight=0",
         "fly --scene": "fly --no-video --set timeout=1 --scene",
     },
     "training": {
@@ -62,6 +59,7 @@ SMALLER = {
         "53248 steps": "16 steps",
         "Env(20, scenario=scenario, num_worlds=20": "Env(2, scenario=scenario, num_worlds=1",
         "< 50": "< 2",
+        'scenario="P01", observation=observed, r': "scenario=replace(scenario, timeout=1), r",
     },
     "monte_carlo": {
         'length=18", "timeout=20': 'length=9", "timeout=2',
@@ -77,6 +75,7 @@ SMALLER = {
     "to_hardware": {
         "timeout 15 splatpilot hardware bridge": "splatpilot hardware bridge --set timeout=1",
         "--scenario P02 --policy diffaero": f"--scenario P02 --policy diffaero {SMALL_WORLD}",
+        "--out out/vehicle": "--set timeout=2 --out out/vehicle",
         "--log": "--set timeout=2 --log",
         "--patience 60": "--patience 300",
         "trials=10": "trials=1",
@@ -139,15 +138,13 @@ class Learner:
 
 
 @pytest.fixture
-def clone(tmp_path, monkeypatch) -> Iterator[Path]:
-    """The current folder, with the examples of a clone; forgets registered policies afterwards."""
+def clone(tmp_path, monkeypatch, viewer, registered) -> Iterator[Path]:
+    """The current folder, with the examples of a clone."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     (tmp_path / "out").mkdir()
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
-    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
-    monkeypatch.setattr(LiveControls, "wait_for_viewer", lambda self: None)
     yield tmp_path
     for name in ("my_policy", "sidestep"):
         sys.modules.pop(name, None)
@@ -168,11 +165,9 @@ def test_results_are_as_promised(name, clone, capsys, request):
         assert long in text, long
         text = text.replace(long, short)
     url = request.getfixturevalue("udp_url") if name == "to_hardware" else ""
-    learner, began = Learner(capsys, url), time.process_time()
+    learner = Learner(capsys, url)
     parts = BLOCK.split(text)
     for before, language, code in zip(parts[::3], parts[1::3], parts[2::3], strict=False):
         learner.run(before.strip(), language, code)
     for promised in re.findall(r"`(out/[\w./-]+)`", "".join(parts[::3])):
         assert promised.endswith("/errors/") or Path(promised).exists(), promised
-    with capsys.disabled():
-        print(f"{name}: {time.process_time() - began:.1f} CPU s")
