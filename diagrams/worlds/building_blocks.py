@@ -1,6 +1,6 @@
 """Building blocks of procedural worlds: volumes, boxes, halls, signs, daylight, lamps."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,7 @@ CLEARING, TIGHT_CLEARING = 1.0, 0.9
 
 MAX_GROUND, MAX_HEIGHT = 20_000.0, 100.0  # [m²] and [m], of generated worlds: 20 million Gaussians
 PASSAGE = 2 * VEHICLE_RADIUS + 0.1  # [m], minimum width of gaps for the vehicle
+MAX_VOXELS = 2e7  # of the distance field of a world on disk: some 90 bytes each
 
 
 def box(lower: ArrayLike, upper: ArrayLike, material: str, seed: int) -> Solid:
@@ -55,10 +56,12 @@ def hall(plan: FloorPlan, materials: list[str], rng: np.random.Generator) -> lis
         ((x0 - WALL, y0, 0), (x0, y1, z1)),
         ((x1, y0, 0), (x1 + WALL, y1, z1)),
     )
-    return [
-        box(low, high, materials[rng.integers(len(materials))], int(rng.integers(1000)))
-        for low, high in sides
-    ]
+    return [box(low, high, *draw_paint(materials, rng)) for low, high in sides]
+
+
+def draw_paint(materials: Sequence[str], rng: np.random.Generator) -> tuple[str, int]:
+    """Draws material and seed of a solid."""
+    return materials[rng.integers(len(materials))], int(rng.integers(1000))
 
 
 def roof(plan: FloorPlan) -> Solid:
@@ -89,13 +92,13 @@ def signs_on(wall: Solid, face: int, count: int, rng: np.random.Generator) -> li
     if reach <= 0 or highest < lowest:
         return []
     offsets = (np.arange(count) + rng.uniform(0.2, 0.8, count)) / count * 2 * reach - reach
-    signs = []
+    signs, size = [], np.full(3, 0.02)
+    size[along], size[2] = SIGN
     for offset in offsets:
-        center, size = p.copy(), np.full(3, 0.02)
+        center = p.copy()
         center[k] += sign * (half[k] + 0.01)
         center[along] += offset
         center[2] = rng.uniform(lowest, highest) + SIGN[1] / 2
-        size[along], size[2] = SIGN
         signs.append(box(center - size / 2, center + size / 2, "signage", int(rng.integers(1000))))
     return signs
 
@@ -132,6 +135,11 @@ def start_and_goal(
 def has_clearance(shape: Shape, p_W: ArrayLike, clearance: float) -> bool:
     """Checks that all points (N, 3) [m] are at least `clearance` [m] from a shape."""
     return bool((ShapeUnion.of([shape]).distance(p_W) >= clearance).all())
+
+
+def suitable_voxel(lower_W: ArrayLike, upper_W: ArrayLike) -> float:
+    """Returns a size of voxels [m] for a box: 0.1 m, or more for `MAX_VOXELS`."""
+    return max(0.1, float(np.cbrt(np.prod(np.subtract(upper_W, lower_W)) / MAX_VOXELS)))
 
 
 @dataclass

@@ -16,7 +16,7 @@ from splatpilot.systems.collision.distance_field import DistanceField, FieldStat
 from splatpilot.systems.collision.esdf import Esdf, distance_to_voxels
 from splatpilot.systems.collision.esdf_build import cubes_of_points
 from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.common.validation import Config, check_seed
+from splatpilot.systems.common.validation import Config
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 _log = logging.getLogger(__name__)
@@ -28,12 +28,10 @@ TRIES = 60  # Maximum number of draws of an instance
 def until_feasible[C: Config](
     draw: Callable[[C, int, np.random.Generator], WorldSpec],
 ) -> Callable[[C, int], WorldSpec]:
-    """Decorates a generator of instances: validates the configuration, draws a feasible one."""
+    """Decorates a generator of instances: draws a feasible one."""
 
     @functools.wraps(draw)
     def make(config: C, seed: int) -> WorldSpec:
-        config.validate()
-        check_seed(seed)
         for attempt in range(TRIES):
             spec = draw(config, seed, np.random.default_rng([seed, attempt]))
             if is_feasible(spec):

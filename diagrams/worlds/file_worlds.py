@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
+from splatpilot.diagrams.worlds.building_blocks import MAX_VOXELS
 from splatpilot.diagrams.worlds.feasibility import SHORTEST, choose_ends
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, find_scene
 from splatpilot.diagrams.worlds.solids.surfaces import (
@@ -30,11 +31,16 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.octomap import Octomap, read_octomap
 from splatpilot.systems.common.files import find_data
 from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.common.validation import Config, bounded, require, require_field
+from splatpilot.systems.common.validation import (
+    Config,
+    bounded,
+    errors_about,
+    require,
+    require_field,
+)
 from splatpilot.systems.splats.scene import GaussianScene
 
 OCTOMAP = ".bt"  # Suffix of binary OctoMaps
-_MAX_VOXELS = 2e7  # of a map that is used whole: some 90 bytes each
 
 _log = logging.getLogger(__name__)
 
@@ -60,14 +66,11 @@ class OctomapConfig(SceneSource):
 
 def octomap_world(config: OctomapConfig, seed: int) -> World:
     """Reads the map of `config`, colored by height."""
-    config.validate()
     path = find_scene(config)
     octomap = read_octomap(path)
     lower_W, upper_W = _flown_part(config, octomap)
-    try:
+    with errors_about(path):
         esdf = octomap.esdf(lower_W, upper_W)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
     if not (esdf.states == FieldState.FREE).any():
         raise InfeasibleFlightError(
             f"{path}: no space from {lower_W} to {upper_W} m is known to be free; choose another "
@@ -84,7 +87,7 @@ def _flown_part(config: OctomapConfig, octomap: Octomap) -> tuple[NDArray, NDArr
     """Returns the corners (3,) [m] of the part to fly in; warns if it is not all."""
     if config.lower is not None and config.upper is not None:
         return np.array(config.lower, float), np.array(config.upper, float)
-    lower_W, upper_W = octomap.part(_MAX_VOXELS)
+    lower_W, upper_W = octomap.part(MAX_VOXELS)
     if (upper_W - lower_W < octomap.upper_W - octomap.lower_W).any():
         _log.warning(
             "%s is large: using the part from %s to %s of %s to %s m; world.lower and world.upper "
@@ -144,8 +147,7 @@ class MeshWorld(Config):
 
 
 def _above_surfaces(esdf: Esdf) -> Esdf:
-    """Returns a field in which free space without any surface below, such as that under terrain, is
-    unknown, unless all is."""
+    """Makes free space without a surface below, as under terrain, unknown, unless all is."""
     free = esdf.states == FieldState.FREE
     above = np.logical_or.accumulate(esdf.states == FieldState.OCCUPIED, axis=2)
     if not (free & above).any():
@@ -160,7 +162,6 @@ def mesh_world(config: MeshWorld, seed: int) -> World:
     from splatpilot.diagrams.worlds.mesh import check_mesh, mesh_distance, sample_colors
     from splatpilot.diagrams.worlds.mesh_renderer import MeshScene, shade
 
-    config.validate()
     path = find_data(Path(config.path), "a mesh")
     check_mesh(path, config.up)
     esdf = mesh_distance(path, config.up, config.voxel_size, config.scale)

@@ -1,14 +1,19 @@
 """Reconstructed scenes with inserted obstacles."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import label
 
-from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, has_clearance, require_order
+from splatpilot.diagrams.worlds.building_blocks import (
+    TIGHT_CLEARING,
+    draw_paint,
+    has_clearance,
+    require_order,
+)
 from splatpilot.diagrams.worlds.feasibility import TRIES
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, draw_ends, read_scene_world
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, cut_faces, draw
@@ -47,13 +52,11 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
     """Reads the scene and inserts solids drawn from the seed near the line from start to goal. Any
     two are at least `gap` apart, start and goal keep 0.9 m, and a route remains that is `gap` wide
     everywhere."""
-    config.validate()
     scene = read_scene_world(config, seed)
     for attempt in range(TRIES):
         rng = np.random.default_rng([seed, attempt])
         if config.draw_ends and attempt % 10 == 9:
-            again = int(rng.integers(2**31))
-            scene = draw_ends(config, scene, again)
+            scene = draw_ends(config, scene, int(rng.integers(2**31)))
         solids = _draw_solids(config, scene, rng)
         if len(solids) < config.least:
             continue
@@ -84,8 +87,7 @@ def _draw_solids(config: InsertedConfig, world: World, rng: np.random.Generator)
         surface = _surface(shape)
         if not all(has_clearance(other.shape, surface, config.gap) for other in solids):
             continue
-        material = _MATERIALS[rng.integers(len(_MATERIALS))]
-        solids.append(Solid(shape, material, int(rng.integers(1000))))
+        solids.append(Solid(shape, *draw_paint(_MATERIALS, rng)))
     return solids
 
 
@@ -152,9 +154,5 @@ def _insert(world: World, solids: list[Solid], esdf: Esdf, seed: int) -> World:
         spacing = observations.voxel_size
         surfaces = np.concatenate([_surface(solid.shape, spacing) for solid in solids])
         observations = observations.with_surfaces(surfaces)
-    frontier = world.num_frontier
-    return World(
-        *(name, gaussians, esdf, esdf, world.background, *ends),
-        num_frontier=frontier,
-        observations=observations,
-    )
+    field = {"esdf": esdf, "distance_field": esdf}
+    return replace(world, name=name, gaussians=gaussians, observations=observations, **field)

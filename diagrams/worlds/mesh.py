@@ -1,8 +1,7 @@
 """Reads meshes: glTF, binary glTF, and Wavefront .obj with its materials.
 
-Faces have two sides, and alpha is what glTF says. Drake draws any alpha as translucent, and its
-depth ignores alpha. So `split` separates surfaces with holes in their textures, which are drawn by
-ray casting, from the others, whose alpha is only that of panes.
+Drake draws any alpha as translucent, and its depth ignores alpha. So `split` separates surfaces
+with holes in their textures, which are drawn by ray casting, from the others.
 """
 
 import json
@@ -17,7 +16,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from PIL import Image
 from pydrake.math import RotationMatrix
 from scipy.ndimage import binary_dilation, map_coordinates
@@ -28,6 +27,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.color import uv_to_interpolated_color
 from trimesh.visual.material import PBRMaterial
 
+from splatpilot.diagrams.worlds.building_blocks import suitable_voxel
 from splatpilot.diagrams.worlds.splits import part_digests
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf, distances_from_band
@@ -44,7 +44,6 @@ _UNITS = {"centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254, "kilomete
 _CUTOFF = 0.5  # glTF's default alpha from which a MASK is opaque
 _VISIBLE = 1 / 255  # alpha from which a BLEND is visible
 _SAMPLES_PER_VOXEL_FACE = 8
-_VOXEL, _MAX_VOXELS = 0.1, 2e7  # [m], and number of suitable voxels
 _NEAREST = 9728
 _WRAPS = {33071: "clamp", 33648: "mirror"}
 # Required extensions that cannot be read, with a remedy each.
@@ -63,15 +62,12 @@ _log = logging.getLogger(__name__)
 
 
 def check_mesh(mesh: Path, up: str) -> None:
-    """Checks the file and the axis of a mesh, and that no extension is required that cannot be
-    read."""
+    """Checks the file, the axis and the required extensions of a mesh."""
     require_file(mesh)
-    suffixes = ", ".join(SUFFIXES)
-    require(
-        mesh.suffix.lower() in SUFFIXES, f"{mesh}: the suffix", f"one of {suffixes}", mesh.suffix
-    )
+    suffix, known = mesh.suffix.lower(), f"one of {', '.join(SUFFIXES)}"
+    require(suffix in SUFFIXES, f"{mesh}: the suffix", known, mesh.suffix)
     require(up in UP, "up", "y (as glTF says) or z", up)
-    if mesh.suffix.lower() != ".obj":
+    if suffix != ".obj":
         with readable(mesh, "mesh"):
             required = _description(mesh.read_bytes()).get("extensionsRequired", [])
         for extension, remedy in _UNREAD.items():
@@ -97,14 +93,12 @@ def mesh_distance(mesh: Path, up: str, voxel_size: float, scale: float = 1.0) ->
     `scale` [m] is the unit of the file. A `voxel_size` of 0 is a suitable one."""
     surface, cut_outs = split(mesh, up, scale)
     if voxel_size == 0:
-        corners = [surface] if cut_outs is None else [surface, cut_outs.surface]
-        p_WV = np.concatenate([part.vertices for part in corners])
+        p_WV = np.concatenate([surface.vertices, cut_outs.surface.vertices])
         voxel_size = suitable_voxel(p_WV.min(axis=0), p_WV.max(axis=0))
     density = _SAMPLES_PER_VOXEL_FACE / voxel_size**2
-    points = [_sample_surface(mesh, surface, density)[0]]
-    if cut_outs is not None:
-        points.append(cut_outs.sample(mesh, density))
-    p_WQ = np.concatenate(points)
+    points, triangle = _sample_surface(mesh, cut_outs.surface, density)
+    points = points[cut_outs.sample_at(triangle, points)[1] > 0]
+    p_WQ = np.concatenate([_sample_surface(mesh, surface, density)[0], points])
     with readable(mesh, "mesh"):
         if not len(p_WQ):
             raise ValueError("it has no surface")
@@ -127,10 +121,9 @@ def sample_colors(
     path: Path, up: str, scale: float, count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
     """Samples the surface of a mesh without its holes: points [m] and normals (N, 3) in W, linear
-    base colors (N, 3), and the area [m^2] that they stand for. N is about `count`, or less with
-    holes."""
+    base colors (N, 3), and the area [m^2] that they stand for. N is at most about `count`."""
     surface, cut_outs = split(path, up, scale)
-    area = surface.area + (0.0 if cut_outs is None else cut_outs.surface.area)
+    area = surface.area + cut_outs.surface.area
     with readable(path, "mesh"):
         scene, _ = _read(path)
         R_WM, parts = UP[up], []
@@ -141,16 +134,16 @@ def sample_colors(
                 continue
             placed = mesh.copy().apply_transform(X_MN)
             number = max(round(count * scale**2 * placed.area / area), 1)
-            sampled: Any = trimesh.sample.sample_surface(
+            drawn: Any = trimesh.sample.sample_surface(
                 placed, number, return_barycentric=True, seed=0
             )
-            points, face, weights = sampled
+            points, face, weights = drawn
             colors = _base_colors(mesh, face, weights)
-            seen = colors[:, 3] >= 255 * _CUTOFF if _has_holes(mesh) else slice(None)
-            normals = placed.face_normals[face]
+            mode = getattr(getattr(mesh.visual, "material", None), "alphaMode", None)
+            seen = (colors[:, 3] >= 255 * _CUTOFF) | (mode not in ("MASK", "BLEND"))
             linear = (colors[:, :3] / 255.0) ** GAMMA
-            parts.append((scale * points @ R_WM.T, normals @ R_WM.T, linear))
-            parts[-1] = tuple(each[seen] for each in parts[-1])
+            sampled = scale * points @ R_WM.T, placed.face_normals[face] @ R_WM.T, linear
+            parts.append([each[seen] for each in sampled])
     points, normals, colors = (np.concatenate(each) for each in zip(*parts, strict=True))
     return points, normals, colors, area
 
@@ -169,17 +162,6 @@ def _base_colors(mesh: trimesh.Trimesh, face: NDArray, weights: NDArray) -> NDAr
         return np.tile(np.asarray(plain, float), (len(face), 1))
     uv = (weights[..., None] * visual.uv[mesh.faces[face]]).sum(axis=1)
     return uv_to_interpolated_color(uv, image) * (factor / 255.0)
-
-
-def _has_holes(mesh: trimesh.Trimesh) -> bool:
-    material = getattr(mesh.visual, "material", None)
-    return getattr(material, "alphaMode", None) in ("MASK", "BLEND")
-
-
-def suitable_voxel(lower_W: ArrayLike, upper_W: ArrayLike) -> float:
-    """Returns a size of voxels [m] for the distance field of a box: fine, but not too many."""
-    volume = np.prod(np.subtract(upper_W, lower_W))
-    return max(_VOXEL, float(np.cbrt(volume / _MAX_VOXELS)))
 
 
 def _sample_surface(
@@ -249,15 +231,10 @@ class CutOuts:
             color[own], alpha[own] = material.sample(uv[own])
         return color, alpha
 
-    def sample(self, path: Path, density: float) -> NDArray[np.float64]:
-        """Returns points (N, 3) [m] outside of holes; see `_sample_surface`."""
-        points, triangle = _sample_surface(path, self.surface, density)
-        return points[self.sample_at(triangle, points)[1] > 0]
-
 
 def split(
     path: Path, up: str, scale: float = 1.0, solid_file: Path | None = None
-) -> tuple[trimesh.Trimesh, CutOuts | None]:
+) -> tuple[trimesh.Trimesh, CutOuts]:
     """Returns the surfaces without and with holes, in W; writes those without, if any, to a .gltf
     file for Drake, in units of the file, `scale` [m]."""
     R_WM = scale * UP[up]
@@ -289,16 +266,13 @@ def split(
                     visual.uv = np.zeros((len(mesh.vertices), 2))
                 solid.append(name)
         surface, _, _ = _surface(scene, solid, R_WM)
-        cut_outs = None
-        if cut:
-            holed, uv, names = _surface(scene, cut, R_WM)
-            order = sorted(set(cut.values()))
-            found = [each for number in order if (each := cut_materials[number]) is not None]
-            material = np.array([order.index(cut[name]) for name in names], dtype=np.intp)
-            cut_outs = CutOuts(holed, uv, material, found)
+        holed, uv, names = _surface(scene, cut, R_WM)
+        order = sorted(set(cut.values()))
+        found = [each for number in order if (each := cut_materials[number]) is not None]
+        material = np.array([order.index(cut[name]) for name in names], dtype=np.intp)
         if not solid and not cut:
             raise ValueError("it holds no triangles")
-    _check_extent(path, surface, cut_outs)
+    _check_extent(path, np.concatenate([surface.vertices, holed.vertices]))
     if solid and solid_file is not None:
         with readable(path, "mesh"):
             scene.delete_geometry([name for name in scene.geometry if name not in solid])
@@ -307,13 +281,11 @@ def split(
             )
             for name, content in files.items():
                 solid_file.with_name(name).write_bytes(content)
-    return surface, cut_outs
+    return surface, CutOuts(holed, uv, material, found)
 
 
-def _check_extent(path: Path, surface: trimesh.Trimesh, cut_outs: CutOuts | None) -> None:
+def _check_extent(path: Path, p_WQ: NDArray[np.float64]) -> None:
     """Checks that surfaces have the size of an environment; suggests another unit if not."""
-    parts = [surface] if cut_outs is None else [surface, cut_outs.surface]
-    p_WQ = np.concatenate([part.vertices for part in parts])
     extent = np.ptp(p_WQ, axis=0) if len(p_WQ) else np.zeros(3)
     low, high = _EXTENTS
     fitting = [
@@ -386,19 +358,14 @@ def _opaque(material: PBRMaterial, number: int) -> PBRMaterial:
     opaque.name, opaque.alphaMode, opaque.doubleSided = str(number), None, True
     for key in ("baseColorTexture", "emissiveTexture", "occlusionTexture"):
         if (image := getattr(opaque, key)) is not None:
-            converted = _eight_bits(image).convert("RGB")
+            if image.mode.startswith("I"):  # 16-bit grays, which Pillow would clip
+                image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+            converted = image.convert("RGB")
             converted.encoderinfo = {"compress_level": 0}  # Compression takes most of the export.
             setattr(opaque, key, converted)
     if opaque.emissiveTexture is None and np.any(opaque.emissiveFactor):
         opaque.emissiveTexture = Image.new("RGB", (1, 1), "white")  # VTK needs one.
     return opaque
-
-
-def _eight_bits(image: Image.Image) -> Image.Image:
-    """Returns an image of 16-bit grays, which Pillow would clip, in 8 bits."""
-    if not image.mode.startswith("I"):
-        return image
-    return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
 
 
 def _restore(tree: dict[str, Any], document: dict[str, Any]) -> None:

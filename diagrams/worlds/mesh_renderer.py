@@ -27,12 +27,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
-from splatpilot.diagrams.worlds.mesh import (
-    GAMMA,
-    CutOuts,
-    check_mesh,
-    split,
-)
+from splatpilot.diagrams.worlds.mesh import GAMMA, CutOuts, check_mesh, split
 from splatpilot.systems.common.extras import require_opengl
 from splatpilot.systems.common.readers import readable
 from splatpilot.systems.common.validation import require
@@ -127,11 +122,9 @@ class MeshRenderer:
             )
         self._engine.RenderDepthImage(DepthRenderCamera(core(1), DepthRange(*depth_range)), depth)
         images = MeshImages(color.astype(np.uint8), np.array(depth.data)[..., 0])
-        return (
-            images
-            if self._cut_outs is None
-            else _draw(self._cut_outs, images, X_WC, K, depth_range[0])
-        )
+        if not self._cut_outs.materials:
+            return images
+        return _draw(self._cut_outs, images, X_WC, K, depth_range[0])
 
 
 def shade(albedo: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -231,14 +224,33 @@ class MeshScene(BakedScene):
     ) -> RenderedView:
         """Renders color and depth; see `BakedScene.render`. The background is that of the mesh, and
         `merged_spread` has no effect."""
+        K = np.array(K, dtype=np.float64)
         if rows is not None:
-            K, height = np.array(K, dtype=np.float64), rows[1] - rows[0]
+            height = rows[1] - rows[0]
             K[1, 2] -= rows[0]
+        camera = K.copy(), width, height, X_WC, near, far
+        slopes, size = None, (width, height)
+        if distortion is not None:
+            # A pinhole camera around all rays of the lens, from which the image is resampled.
+            slopes = pixel_slopes(distortion, K, *size)
+            lower, upper = np.nanmin(slopes, axis=(0, 1)), np.nanmax(slopes, axis=(0, 1))
+            widest = max(-lower.min(), upper.max())
+            require(widest < _MAX_SLOPE, "slopes of rays in a mesh", f"< {_MAX_SLOPE}", widest)
+            focal = K[[0, 1], [0, 1]]
+            K[:2, 2] = 1 - focal * lower
+            size = tuple(np.ceil(focal * (upper - lower) + 2).astype(int).tolist())
         span = max(near, _NEAR), min(far, _FAR)
-        color, depth = self._images(K, (width, height), X_WC, span, distortion, with_color)
+        images = self._renderer.render(X_WC, K, *size, depth_range=span, with_color=with_color)
+        color, depth = images
+        depth = np.where(np.isfinite(depth), depth, np.float32(0))
+        if slopes is not None:
+            points = (slopes * K[[0, 1], [0, 1]] + K[:2, 2] - 0.5).astype(np.float32)
+            points[np.isnan(points[..., 0])] = -1e6  # outside, where remap fills with 0
+            u, v = np.ascontiguousarray(np.moveaxis(points, -1, 0))
+            color = np.asarray(cv2.remap(color, u, v, cv2.INTER_LINEAR))
+            depth = np.asarray(cv2.remap(depth, u, v, cv2.INTER_NEAREST))
         view = RenderedView((color / 255).astype(np.float32), depth, (depth > 0).astype(np.float32))
         if len(moving.means):
-            camera = np.asarray(K, float), width, height, X_WC, near, far
             bodies = empty_scene().render(*camera, moving=moving, distortion=distortion)
             view = _in_front(view, bodies)
         depth = np.where(view.depth <= max_depth, view.depth, np.float32(0))
@@ -251,42 +263,6 @@ class MeshScene(BakedScene):
     def render_depth(self, *camera: Any, **options: Any) -> NDArray[np.float32]:
         """Renders depth (H, W) [m]; see `BakedScene.render_depth`."""
         return self.render(*camera, **options, with_color=False).depth
-
-    def _images(
-        self,
-        K: ArrayLike,
-        size: tuple[int, int],
-        X_WC: RigidTransform,
-        span: tuple[float, float],
-        distortion: Distortion | None,
-        with_color: bool,
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Returns color (H, W, 3), black if not asked, and depth (H, W) [m], 0 without a surface.
-
-        Args:
-            size: width and height [px].
-            span: smallest and largest depth [m].
-        """
-        K, slopes = np.array(K, dtype=np.float64), None
-        if distortion is not None:
-            # A pinhole camera around all rays of the lens, from which the image is resampled.
-            slopes = pixel_slopes(distortion, K, *size)
-            lower, upper = np.nanmin(slopes, axis=(0, 1)), np.nanmax(slopes, axis=(0, 1))
-            widest = max(-lower.min(), upper.max())
-            require(widest < _MAX_SLOPE, "slopes of rays in a mesh", f"< {_MAX_SLOPE}", widest)
-            focal = K[[0, 1], [0, 1]]
-            K[:2, 2] = 1 - focal * lower
-            size = tuple(np.ceil(focal * (upper - lower) + 2).astype(int).tolist())
-        images = self._renderer.render(X_WC, K, *size, depth_range=span, with_color=with_color)
-        seen = np.where(np.isfinite(images.depth), images.depth, np.float32(0))
-        if slopes is None:
-            return images.color, seen
-        points = (slopes * K[[0, 1], [0, 1]] + K[:2, 2] - 0.5).astype(np.float32)
-        hidden = np.isnan(points[..., 0])
-        points[hidden] = -1e6  # outside, where remap fills with 0
-        u, v = np.ascontiguousarray(points[..., 0]), np.ascontiguousarray(points[..., 1])
-        color = cv2.remap(images.color, u, v, cv2.INTER_LINEAR)
-        return np.asarray(color), np.asarray(cv2.remap(seen, u, v, cv2.INTER_NEAREST))
 
 
 def _in_front(view: RenderedView, bodies: RenderedView) -> RenderedView:

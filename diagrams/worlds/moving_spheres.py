@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from splatpilot.diagrams.worlds.building_blocks import daylight, ground
 from splatpilot.diagrams.worlds.forest.forest import trees_around
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, build, draw
-from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
+from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan, even_directions
 from splatpilot.diagrams.worlds.solids.textures import Illumination
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.shapes import MovingSpheres, Sphere
@@ -59,17 +59,14 @@ def add_moving_spheres(world: World, spheres: Mapping[str, MovingSphere]) -> Wor
 
 def _draw_sphere(radius: float) -> GaussianScene:
     """Returns Gaussians spread evenly over a sphere about the origin."""
-    z = 1.0 - 2.0 * (np.arange(_COUNT) + 0.5) / _COUNT
-    azimuth = np.arange(_COUNT) * np.pi * (3.0 - np.sqrt(5.0))
-    ring = np.sqrt(1.0 - z * z)
-    normals = np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
+    normals = even_directions(_COUNT)
     return GaussianScene.from_colors(
         radius * normals,
         np.tile([1.0, 0.0, 0.0, 0.0], (_COUNT, 1)),
         np.full((_COUNT, 3), 1.2 * radius / np.sqrt(_COUNT)),
         np.full(_COUNT, 0.95),
         # Lighter above.
-        np.clip(np.outer(0.8 + 0.3 * z, _COLOR), 0.0, 1.0),
+        np.clip(np.outer(0.8 + 0.3 * normals[:, 2], _COLOR), 0.0, 1.0),
     )
 
 
@@ -179,7 +176,6 @@ class DodgeDroneConfig(Config):
 
 def dodgedrone_world(config: DodgeDroneConfig, seed: int) -> World:
     """Returns the course of `config` and `seed`, feasible or not."""
-    config.validate()
     rng = np.random.default_rng([seed, 0])
     obstacles = draw_obstacles(LEVELS[config.level], config.first_seed + seed)
     static = [o for o in obstacles if len(o.path) == 1 and np.isfinite(o.path).all()]

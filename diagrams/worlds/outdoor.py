@@ -1,6 +1,7 @@
 """Obstacle fields and halls: clutter, branches and wires, walls, barriers."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,8 +68,7 @@ def clutter_spec(config: ClutterConfig, seed: int, rng: np.random.Generator) -> 
 def _sphere(config: ClutterConfig, plan: FloorPlan, rng: np.random.Generator) -> Solid:
     radius = rng.uniform(config.sphere_min, config.sphere_max)
     p = rng.uniform(plan.lower, plan.upper)
-    material = _SPHERES[rng.integers(len(_SPHERES))]
-    return Solid(Sphere(p, float(radius)), material, int(rng.integers(1000)))
+    return Solid(Sphere(p, float(radius)), *blocks.draw_paint(_SPHERES, rng))
 
 
 def _box(config: ClutterConfig, plan: FloorPlan, rng: np.random.Generator) -> Solid:
@@ -84,8 +84,7 @@ def _box(config: ClutterConfig, plan: FloorPlan, rng: np.random.Generator) -> So
         top = rng.uniform(2.0, max(config.height, 2.5))
         half[2] = top / 2 + 0.3
         p[2] = top / 2 - 0.3
-    material = _BOXES[rng.integers(len(_BOXES))]
-    return blocks.rotated_box(p, R, 2 * half, material, int(rng.integers(1000)))
+    return blocks.rotated_box(p, R, 2 * half, *blocks.draw_paint(_BOXES, rng))
 
 
 @dataclass
@@ -153,7 +152,7 @@ def _limbs_and_wires(
 PATTERNS = "big_wall", "u_trap", "slits", "slalom"
 
 _FACADES = ["brick", "brick", "concrete", "metal", "wood", "plaster"]
-_ACROSS = ["brick", "concrete", "metal", "wood", "foliage"]
+_paint = partial(blocks.draw_paint, ["brick", "concrete", "metal", "wood", "foliage"])
 
 
 @dataclass
@@ -213,15 +212,11 @@ def _across(config: WallsConfig, x: float, y0: float, y1: float, material: str, 
     )
 
 
-def _material(rng: np.random.Generator) -> tuple[str, int]:
-    return _ACROSS[rng.integers(len(_ACROSS))], int(rng.integers(1000))
-
-
 def _big_wall(config: WallsConfig, rng: np.random.Generator) -> list[Solid]:
     spare = (config.width - config.wall) / 2  # [m] at either side of a wall in the middle
     x = rng.uniform(0.42, 0.58) * config.length
     y = rng.choice([-1, 1]) * rng.uniform(0.3, 0.7) * spare
-    return [_across(config, x, y - config.wall / 2, y + config.wall / 2, *_material(rng))]
+    return [_across(config, x, y - config.wall / 2, y + config.wall / 2, *_paint(rng))]
 
 
 def _u_trap(config: WallsConfig, rng: np.random.Generator) -> list[Solid]:
@@ -229,7 +224,7 @@ def _u_trap(config: WallsConfig, rng: np.random.Generator) -> list[Solid]:
     x = rng.uniform(0.58, 0.66) * config.length
     y = rng.uniform(-0.4, 0.4) * spare
     low, high = y - config.wall / 2, y + config.wall / 2
-    paint = _material(rng)
+    paint = _paint(rng)
     sides = [
         blocks.box(
             (x - config.depth, a, 0), (x - blocks.WALL / 2, a + blocks.WALL, config.height), *paint
@@ -252,7 +247,7 @@ def _slits(config: WallsConfig, rng: np.random.Generator) -> list[Solid]:
         reach = half - slit / 2 - 0.5
         draws = rng.uniform(-reach, reach, 50)
         y = draws[np.argmax(np.abs(draws - last) > 0.25 * config.width)]
-        paint = _material(rng)
+        paint = _paint(rng)
         walls.append(_across(config, x, -half, y - slit / 2, *paint))
         walls.append(_across(config, x, y + slit / 2, half, *paint))
         last = y
@@ -264,7 +259,7 @@ def _slalom(config: WallsConfig, rng: np.random.Generator) -> list[Solid]:
     walls = []
     for k, x in enumerate(_stations(config, config.walls, rng)):
         ends = (-half, config.wall - half) if (k + side) % 2 else (half - config.wall, half)
-        walls.append(_across(config, x, *ends, *_material(rng)))
+        walls.append(_across(config, x, *ends, *_paint(rng)))
     return walls
 
 
@@ -303,8 +298,7 @@ def over_under_spec(config: OverUnderConfig, seed: int, rng: np.random.Generator
         x = blocks.INSET + step * (k + 1 + rng.uniform(-0.08, 0.08))
         low, high = (0.0, config.over) if (k + first) % 2 else (config.under, config.height)
         corners = (x - blocks.WALL / 2, -half, low), (x + blocks.WALL / 2, half, high)
-        material = _MATERIALS[rng.integers(len(_MATERIALS))]
-        barriers.append(blocks.box(*corners, material, int(rng.integers(1000))))
+        barriers.append(blocks.box(*corners, *blocks.draw_paint(_MATERIALS, rng)))
     sides = blocks.hall(plan, ["plaster", "brick", "concrete", "metal"], rng)
     signs = [s for wall in barriers for s in blocks.signs_on(wall, 0, 2, rng)]
     signs += blocks.signs_in(sides, 3, 0, rng)

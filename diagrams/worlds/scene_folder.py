@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from pydrake.math import RigidTransform
 
+from splatpilot.diagrams.worlds.building_blocks import suitable_voxel
 from splatpilot.diagrams.worlds.feasibility import SHORTEST, choose_ends
 from splatpilot.diagrams.worlds.observed_routes import MAX_UNOBSERVED, choose_observed_route
 from splatpilot.diagrams.worlds.solids.surfaces import Surfels, to_gaussians
@@ -150,7 +151,6 @@ def read_gaussians(scene: Path) -> GaussianScene:
     return read_ply(file) if file.name == GAUSSIANS else read_splats(file)
 
 
-_MAX_VOXELS = 2e7
 _MAX_VOXEL = 0.25  # [m], at which a vehicle of 0.354 m radius still finds a route
 
 
@@ -261,7 +261,7 @@ def _read_bare_gaussians(path: Path) -> World:
     # Outliers must not stretch the grid; beyond it all counts as occupied.
     lower_W, upper_W = np.percentile(gaussians.means.astype(float), [1, 99], axis=0)
     lower_W, upper_W = lower_W - 0.1, upper_W + 0.1
-    voxel_size = max(0.1, float(np.cbrt(np.prod(upper_W - lower_W) / _MAX_VOXELS)))
+    voxel_size = suitable_voxel(lower_W, upper_W)
     extent = np.round(upper_W - lower_W, 1).tolist()
     condition = f"small enough for voxels of {_MAX_VOXEL} m"
     remedy = "crop far Gaussians away, or rescale with `splatpilot scene scale`"
@@ -301,7 +301,6 @@ class SceneConfig(SceneSource):
 
 def find_scene(config: SceneSource) -> Path:
     """Returns the path of a scene."""
-    config.validate()
     return require_scene(config.path, config.source)
 
 

@@ -24,6 +24,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import require_configuration
 from splatpilot.systems.common.distributions import sample_distributions
 from splatpilot.systems.common.registry import Registry
+from splatpilot.systems.common.validation import check_seed
 
 
 class WorldConfig(Protocol):
@@ -70,7 +71,7 @@ def make_world(config: WorldConfig, seed: int) -> World:
     The seed is of generated worlds, inserted obstacles, start and goal if they are drawn, and the
     distributions of the configuration, see `sample_scenario`.
     """
-    config = sample_distributions(config, seed, ("world",))
+    config = _draw(config, seed)
     world = WORLDS.entry_for(config).make(config, seed)
     if not isinstance(world, World):
         name, made = type(config).__name__, type(world).__name__
@@ -80,6 +81,14 @@ def make_world(config: WorldConfig, seed: int) -> World:
     if "baked" in vars(world):
         vars(made)["baked"] = world.baked
     return made
+
+
+def _draw(config: WorldConfig, seed: int) -> WorldConfig:
+    """Draws the distributions of a configuration, and validates it."""
+    check_seed(seed)
+    drawn = sample_distributions(config, seed, ("world",))
+    drawn.validate()
+    return drawn
 
 
 def scene_config(path: Path) -> SceneConfig | OctomapConfig:
@@ -98,7 +107,7 @@ def make_spec(config: WorldConfig, seed: int) -> WorldSpec:
     plan = WORLDS.entry_for(config).make_spec
     if plan is None:
         raise ValueError(f"{type(config).__name__} is not a generated world: it has no spec")
-    return plan(sample_distributions(config, seed, ("world",)), seed)
+    return plan(_draw(config, seed), seed)
 
 
 register_world(ForestConfig, make_spec=forest_spec)

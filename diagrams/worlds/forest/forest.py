@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from splatpilot.diagrams.worlds.building_blocks import CLEARING, INSET
+from splatpilot.diagrams.worlds.building_blocks import INSET
 from splatpilot.diagrams.worlds.forest.layout import (
     MARGIN,
     ForestConfig,
@@ -41,7 +41,6 @@ from splatpilot.diagrams.worlds.solids.textures import (
     shade,
     smoothstep,
 )
-from splatpilot.systems.common.validation import check_seed
 from splatpilot.systems.splats.scene import GaussianScene
 
 
@@ -315,17 +314,17 @@ def trunks(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -
         for i in np.flatnonzero(trees.species == species):
             radius = trees.radius[i]
             # Finest where the camera flies; crowns hide what is above the ceiling.
-            for p_A, p_B, coarse in ((foot[i], middle[i], 1.0), (middle[i], top[i], 1.45)):
+            for p_A, p_B, coarse, along, taper in (
+                (foot[i], middle[i], 1.0, 0.32, 1.0),
+                (middle[i], top[i], 1.45, 0.32, 1.0),
+                (top[i], tip[i], 2.5, 0.26, 0.2),
+            ):
                 coarse *= 1 + 0.4 * away[i]
-                spacing = min(0.12 * coarse, widest(radius, _INSET * coarse)), 0.32 * coarse
-                layers["fissures"].append((tube(p_A, p_B, radius, spacing, rng), i))
-                if away[i] < 4:
+                spacing = min(0.12 * coarse, widest(radius, _INSET * coarse)), along * coarse
+                layers["fissures"].append((tube(p_A, p_B, radius, spacing, rng, taper), i))
+                if away[i] < 4 and taper == 1.0:
                     spacing = marks.around * coarse, marks.along * coarse
                     layers["marks"].append((tube(p_A, p_B, radius, spacing, rng), i))
-            coarse = 2.5 * (1 + 0.4 * away[i])
-            spacing = min(0.12 * coarse, widest(radius, _INSET * coarse)), 0.26 * coarse
-            crowned = tube(top[i], tip[i], radius, spacing, rng, taper=0.2)
-            layers["fissures"].append((crowned, i))
         for layer, tubes in layers.items():
             if not tubes:
                 continue
@@ -432,12 +431,9 @@ def crowns(layout: ForestLayout, light: Daylight, rng: np.random.Generator) -> G
 
 
 def forest_spec(config: ForestConfig, seed: int) -> WorldSpec:
-    """Grows the forest of `config`.
-
-    A path from start to goal exists by construction: trunks grown by the vehicle's radius are
-    disjoint and leave space at the sides (`TrunksConfig.check`), so they cannot close a line from
-    side to side; rocks and logs end below the flight height, and no trunk is near start and goal.
-    """
+    """Grows the forest of `config`, through which a path exists: trunks grown by the vehicle's
+    radius are disjoint and leave space at the sides (`TrunksConfig.check`), rocks and logs end
+    below the flight height, and no trunk is near start and goal."""
     return Forest(config, seed).spec()
 
 
@@ -445,14 +441,12 @@ class Forest:
     """Layout and light of the forest of `config` and `seed`."""
 
     def __init__(self, config: TrunksConfig, seed: int) -> None:
-        config.validate()
-        check_seed(seed)
         self.config, self.seed = config, seed
         # A stream of random numbers per part, so that parts change independently.
         layout_rng, light_rng = (np.random.default_rng([seed, k]) for k in range(2))
         self.p_WS = np.array([INSET, 0.0, config.flight_height])
         self.p_WG = np.array([config.length - INSET, 0.0, config.flight_height])
-        self.layout = lay_out(config, layout_rng, [self.p_WS[:2], self.p_WG[:2]], CLEARING)
+        self.layout = lay_out(config, layout_rng, [self.p_WS[:2], self.p_WG[:2]])
         self.light = ForestLight(Daylight.sample(light_rng), self.layout, seed)
 
     def spec(self) -> WorldSpec:

@@ -140,13 +140,10 @@ class ForestLayout(FloorPlan):
         return solids, far + upper
 
 
-def lay_out(
-    config: TrunksConfig, rng: np.random.Generator, clear: ArrayLike, clearance: float
-) -> ForestLayout:
-    """Draws a layout that leaves discs of radius `clearance` [m] about `clear` (K, 2) open."""
-    clear = np.asarray(clear)
-    plan = FloorPlan.of_size(config.length, config.width, config.height)
-    lower, upper = plan.lower, plan.upper
+def lay_out(config: TrunksConfig, rng: np.random.Generator, clear: ArrayLike) -> ForestLayout:
+    """Draws a layout that leaves discs of radius `CLEARING` about `clear` (K, 2) [m] open."""
+    clear, clearance = np.asarray(clear), building_blocks.CLEARING
+    lower, upper = config.plan.lower, config.plan.upper
     base = building_blocks.poisson_disk(lower[:2] - MARGIN, upper[:2] + MARGIN, config.spacing, rng)
     if config.density > 0.0:
         count = round(config.density * float(np.prod(upper[:2] - lower[:2] + 2.0 * MARGIN)))

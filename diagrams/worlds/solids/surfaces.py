@@ -191,14 +191,18 @@ def tube(
     )
 
 
+def even_directions(count: int) -> NDArray[np.float64]:
+    """Returns unit vectors (count, 3) along a spiral of golden angles, from z to -z."""
+    k = np.arange(count)
+    z = 1 - (2 * k + 1) / count
+    angle, ring = k * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z * z)
+    return np.column_stack([ring * np.cos(angle), ring * np.sin(angle), z])
+
+
 def sphere(p_C: ArrayLike, radius: float, spacing: float) -> Surfels:
-    """Covers the sphere about p_C (3,) evenly, along a spiral of golden angles."""
+    """Covers the sphere about p_C (3,) evenly."""
     N = max(12, round(4 * np.pi * radius**2 / spacing**2))
-    k = np.arange(N)
-    z = 1 - (2 * k + 1) / N
-    angle = k * np.pi * (3 - np.sqrt(5))
-    across = np.sqrt(1 - z * z)
-    normal = np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
+    normal = even_directions(N)
     return Surfels(
         p=np.asarray(p_C) + radius * normal,
         n=normal,

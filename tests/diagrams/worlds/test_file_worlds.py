@@ -36,7 +36,7 @@ def test_large_maps_are_cropped_about_free_space(in_map, monkeypatch, caplog):
     whole = in_map(octomap)
     np.testing.assert_allclose(whole.esdf.upper_W - whole.esdf.lower_W, [20, 10, 4])
     assert not caplog.text
-    monkeypatch.setattr(module, "_MAX_VOXELS", 80 * 40 * 16 / 4)
+    monkeypatch.setattr(module, "MAX_VOXELS", 80 * 40 * 16 / 4)
     world = in_map(octomap)
     np.testing.assert_allclose(world.esdf.upper_W - world.esdf.lower_W, [10, 5, 4], atol=0.5)
     middle = 0.5 * (world.esdf.lower_W + world.esdf.upper_W)

@@ -4,7 +4,7 @@ from scipy.spatial.distance import pdist
 
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import scenario_file
-from splatpilot.diagrams.worlds.building_blocks import CLEARING, INSET, PASSAGE
+from splatpilot.diagrams.worlds.building_blocks import INSET, PASSAGE
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig, lay_out
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -29,7 +29,7 @@ def _layout(config: ForestConfig, seed: int):
     p_WS = np.array([INSET, 0, config.flight_height])
     p_WG = np.array([config.length - INSET, 0, config.flight_height])
     rng = np.random.default_rng(seed)
-    layout = lay_out(config, rng, [p_WS[:2], p_WG[:2]], CLEARING)
+    layout = lay_out(config, rng, [p_WS[:2], p_WG[:2]])
     shapes = [solid.shape for solid in layout.solids()[0]]
     field = AnalyticDistanceField(shapes, layout.lower, layout.upper)
     return layout, field, p_WS, p_WG
