@@ -9,7 +9,6 @@ import signal
 import struct
 import sys
 import threading
-from collections.abc import Iterable
 from os.path import isfile
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,6 +33,7 @@ from splatpilot.training.captures.capture import (
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frames import (
     FrameFiles,
+    first_file,
     open_frames,
     pose_from_matrix,
     read_depth,
@@ -63,19 +63,14 @@ def import_pycolmap() -> ModuleType:
 
 
 def model_folder(path: Path) -> Path | None:
-    """Returns the folder of the COLMAP model in a capture, the largest of several, None without
-    one."""
+    """Returns the folder of the COLMAP model in a capture, the largest of several, if any."""
     for name in _MODEL_FOLDERS:
-        if found := [each for each in _siblings(path / name) if _images_file(each)]:
-            return max(found, key=lambda each: _images_file(each).stat().st_size)  # pyright: ignore
+        folders = [path / name]
+        if folders[0].name == "0" and folders[0].parent.is_dir():  # parts of a scene fell apart
+            folders = sorted(each for each in folders[0].parent.iterdir() if each.name.isdigit())
+        if found := list(filter(None, map(_images_file, folders))):
+            return max(found, key=lambda file: file.stat().st_size).parent
     return None
-
-
-def _siblings(folder: Path) -> list[Path]:
-    """Returns a model's folder, and those of the other parts of a scene that fell apart."""
-    if folder.name != "0" or not folder.parent.is_dir():
-        return [folder]
-    return sorted(each for each in folder.parent.iterdir() if each.name.isdigit())
 
 
 def _images_file(folder: Path) -> Path | None:
@@ -151,10 +146,10 @@ def open_model(
         return FrameFiles(
             images / image.name,
             lambda: pose_from_matrix(camera_to_world, f"{path}, image {image.name}"),
-            _existing(depths / stem.with_suffix(s) for s in (".npy", ".png")) if depths else None,
+            first_file(*(depths / stem.with_suffix(s) for s in (".npy", ".png") if depths)),
             lenses[image.camera_id],
             # COLMAP lets the mask of a PNG have its name.
-            _existing(masks / name for name in mask_names if name.lower().endswith(".png")),
+            first_file(*(masks / name for name in mask_names if name.lower().endswith(".png"))),
             name=image.name,
         )
 
@@ -208,10 +203,6 @@ def open_model(
 def mask_folder(images: Path) -> Path:
     """Returns the folder `masks` of images: next to a folder `images`, or inside another."""
     return images.with_name("masks") if images.name == "images" else images / "masks"
-
-
-def _existing(files: Iterable[Path]) -> Path | None:
-    return next((file for file in files if isfile(file)), None)
 
 
 def _unmasked_points(

@@ -9,6 +9,7 @@ import unicodedata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from os.path import isfile
 from pathlib import Path
 from typing import Any
 
@@ -51,14 +52,19 @@ _SAME_SHAPE = 0.02  # relative difference of aspect ratios below which depth sho
 
 
 def existing_file(file: Path) -> Path:
-    """Returns the file, or the one that is meant if another system wrote its name: with \\ for /,
-    or with letters and accents composed otherwise."""
+    """Returns the file, or that of a name as other systems write it: with \\ for /, or with letters
+    and accents composed otherwise."""
     if not file.exists():
         for name in (str(file), str(file).replace("\\", "/")):
             for form in ("NFC", "NFD"):
                 if (found := Path(unicodedata.normalize(form, name))).exists():
                     return found
     return file
+
+
+def first_file(*files: Path) -> Path | None:
+    """Returns the first of the files that exists, if any."""
+    return next((file for file in files if isfile(file)), None)
 
 
 def image_header(file: Path) -> tuple[tuple[int, int], str]:
@@ -115,8 +121,7 @@ def _read_alpha(file: Path) -> NDArray[np.bool_]:
 
 def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
     """Returns depth (H, W) [m] from `.npy`, `.exr`, or an image of integers or floats, in `unit`
-    per meter. NaN, negative depth and the largest 16-bit number, which sensors write where they see
-    nothing, become 0, unknown."""
+    per meter. NaN, negative depth and 65535 of 16 bits become 0, unknown."""
     if file.suffix == ".npy":
         raw = readers.read_array(file)
     elif file.suffix == ".exr":
@@ -174,12 +179,10 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
 
 
 def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
-    """Returns the rows of numbers of a text file, each (columns,), called `what` in messages. NaN
-    is read as such; lines that start with # and empty lines at the end are left out."""
-    rows = []
-    for number, line in enumerate(
-        readers.read_text(file, "replace").rstrip().splitlines(), start=1
-    ):
+    """Returns the rows of numbers of a text file, each (columns,), called `what` in messages;
+    without lines that start with # and empty lines at the end."""
+    rows, text = [], readers.read_text(file, "replace").rstrip()
+    for number, line in enumerate(text.splitlines(), start=1):
         if line.startswith("#"):
             continue
         try:
@@ -192,7 +195,7 @@ def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
 
 
 def read_matrix(file: Path) -> NDArray[np.float64]:
-    """Returns the matrix (4, 4) in a text file; NaN and infinities are read as such."""
+    """Returns the matrix (4, 4) in a text file."""
     rows = read_rows(file, 4, "a row of a 4x4 matrix")
     require(len(rows) == 4, f"{file}", "a 4x4 matrix", f"{len(rows)} rows")
     return np.array(rows)
@@ -293,9 +296,8 @@ def open_frames(
     `depth_camera` return the cameras of images and depth images of a width and height [px], for
     frames without their own; without `depth_camera` depth has the pixels of the images before they
     are undistorted or, if `stretch_depth`, another resolution. `read_depth` reads a file of
-    `depth_unit` units per meter. `up` is the up direction of the files' world, see `turn_upright`;
-    empty leaves that to the caller. `dropped` are messages about frames left out already, which do
-    not count further.
+    `depth_unit` units per meter. `up` is that of the files' world, see `turn_upright`; empty leaves
+    it as it is. `dropped` are messages about frames left out already.
     """
     config = config or CaptureConfig()
     messages, complete, missing = list(dropped), [], 0
@@ -431,9 +433,8 @@ def _inspect(frame: FrameFiles) -> _Frame:
 def _drop_other_sizes(
     frames: Sequence[_Frame], messages: list[str], registered: bool, same_view: bool
 ) -> list[_Frame]:
-    """Returns the frames in the most frequent sizes of images and depth, and appends messages about
-    others. Depth must have the size of its image if `registered`, its aspect ratio if `same_view`.
-    """
+    """Returns the frames in the most frequent sizes of images and depth. Depth must have the size
+    of its image if `registered`, its aspect ratio if `same_view`."""
     sizes = [frame.size for frame in frames if frame.files.lens is None]
     depth_sizes = [frame.depth_size for frame in frames if frame.depth_size]
     usual, usual_depth = (max(each, key=each.count, default=None) for each in (sizes, depth_sizes))

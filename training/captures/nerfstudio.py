@@ -1,16 +1,13 @@
 """Captures in nerfstudio's `transforms.json`.
 
 As nerfstudio documents it: `transform_matrix` takes camera axes of OpenGL (x right, y up, z back)
-to a world with z up; intrinsics and distortion are given once or with each frame; a
-`depth_file_path` holds planar depth in units of `depth_unit_scale_factor` (0.001); `mask_path`
-holds an image that is black where the other is not to be used; `ply_file_path` holds points;
-`train_filenames`, `val_filenames` and `test_filenames` split the frames. ScanNet++ adds `is_bad`
-and `test_frames`. Lengths are taken to be in meters if there is depth.
+to a world with z up; intrinsics and distortion are given once or with each frame; depth is planar
+in units of `depth_unit_scale_factor` (0.001); masks are black where pixels are not to be used.
+ScanNet++ adds `is_bad` and `test_frames`. Lengths are taken to be in meters if there is depth.
 """
 
 import dataclasses
 import json
-from os.path import isfile
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -93,9 +90,7 @@ def read(path: Path, config: CaptureConfig) -> Capture:
                 held_out=bool(held_out[i]),
             )
         )
-    unused = content.keys() - _KNOWN | {key for entry in entries for key in entry}.difference(
-        _KNOWN_IN_FRAMES
-    )
+    unused = content.keys() - _KNOWN | set().union(*entries) - _KNOWN_IN_FRAMES
     capture = open_frames(
         path,
         "nerfstudio capture",
@@ -150,8 +145,7 @@ def _pose(matrix: Any, source: str) -> RigidTransform:
 
 def _image_file(file: Path) -> Path:
     """Returns the file of an image, whose name may be without its suffix."""
-    known = file.suffix.lower() in IMAGE_SUFFIXES
-    if isfile(file) or known or not file.parent.is_dir():
+    if file.is_file() or file.suffix.lower() in IMAGE_SUFFIXES or not file.parent.is_dir():
         return file
     return next((f for f in sorted(file.parent.iterdir()) if f.stem == file.name), file)
 
@@ -174,10 +168,9 @@ def _lens(
         if config.intrinsics:
             fx, fy, cx, cy = config.intrinsics
         else:
-            if "fl_x" in values:
-                fx = float(values["fl_x"])
-            else:
-                fx = width / 2 / np.tan(float(values["camera_angle_x"]) / 2)
+            if "fl_x" not in values:
+                values["fl_x"] = width / 2 / np.tan(float(values["camera_angle_x"]) / 2)
+            fx = float(values["fl_x"])
             fy = float(values.get("fl_y", fx))
             cx, cy = (float(values.get(k, n / 2)) for k, n in (("cx", width), ("cy", height)))
         listed = dict(zip(_DISTORTION, values.get("distortion_params") or (), strict=False))

@@ -32,15 +32,10 @@ from splatpilot.systems.common.files import (
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.provenance import TRAINING_SEEDS, VALIDATION_SEEDS
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
-from splatpilot.training.captures.capture import CaptureFrame, pinhole
-from splatpilot.training.captures.coverage import (
-    CapturePlan,
-    plan_capture,
-    poses_along,
-    resample,
-)
+from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.captures.coverage import CapturePlan, plan_capture, poses_along, resample
 from splatpilot.training.captures.frames import pose_row
-from splatpilot.training.captures.tartanair import AXES
+from splatpilot.training.captures.tartanair import AXES, intrinsics
 
 _log = logging.getLogger(__name__)
 
@@ -111,8 +106,7 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
 
     `world` is a mesh (.gltf, .glb or .obj) or a scenario ("P02", or a .yaml file) of a procedural
     world, which is drawn from `seed` and exported as `world.gltf` into the capture. Frames are
-    collected in `.NAME.partial` next to `out`, where the same command resumes. A complete capture
-    is left as it is.
+    collected in `.NAME.partial` next to `out`, where the same call resumes.
     """
     config.validate()
     out = Path(out).absolute()
@@ -183,9 +177,7 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
         free = [X_WC for X_WC in moved if _is_free(esdf, X_WC.translation(), config.clearance)]
         _write_frames(partial / f"offset_{offset:+.2f}", f"offset {offset:+.2f} m", free, view)
     if plan is not None:
-        with written_atomically(partial / COVERAGE) as file:
-            _, content = cv2.imencode(".png", np.ascontiguousarray(plan.picture()[..., ::-1]))
-            file.write_bytes(content.tobytes())
+        _write_png(partial / COVERAGE, plan.picture())
     if out.exists():
         out.rmdir()
     partial.rename(out)
@@ -194,13 +186,13 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
 
 
 def true_camera(capture: Path) -> Callable[[RigidTransform], CaptureFrame] | None:
-    """Returns a function that renders the world of a rendered capture at any pose X_WC, in the
-    capture's camera; None if the capture was not rendered."""
+    """Returns a function that renders the world of a rendered capture at a pose X_WC in its camera;
+    None if the capture was not rendered."""
     recipe = rendered_world(capture)
     if recipe is None:
         return None
-    current, what = recipe.version == _VERSION, f"{capture / RECIPE}: version"
-    require(current, what, f"{_VERSION}", recipe.version, "render it again")
+    what, remedy = f"{capture / RECIPE}: version", "render it again"
+    require(recipe.version == _VERSION, what, f"{_VERSION}", recipe.version, remedy)
     recipe.config.validate()
     return _camera(capture / recipe.mesh, recipe.config)
 
@@ -208,14 +200,9 @@ def true_camera(capture: Path) -> Callable[[RigidTransform], CaptureFrame] | Non
 def _camera(mesh: Path, config: RenderConfig) -> Callable[[RigidTransform], CaptureFrame]:
     """Returns a function that renders a mesh with a camera as TartanAir's, 90 degrees wide."""
     renderer = MeshRenderer(mesh, config.up, config.background, config.scale)
-    width, height = config.width, config.height
-    K = _intrinsics(config)
-    return lambda X_WC: CaptureFrame(*renderer.render(X_WC, K, width, height), X_WC, K)
-
-
-def _intrinsics(config: RenderConfig) -> NDArray[np.float64]:
-    width, height = config.width, config.height
-    return pinhole(width / 2, width / 2, width / 2, height / 2)
+    size = config.width, config.height
+    K = intrinsics(*size)
+    return lambda X_WC: CaptureFrame(*renderer.render(X_WC, K, *size), X_WC, K)
 
 
 def rendered_world(capture: Path) -> RenderedWorld | None:
@@ -235,8 +222,7 @@ def _generated_split(world: WorldConfig, seed: int) -> str:
 
 
 def _shown(world: WorldConfig, seed: int) -> Any:
-    """Returns the configuration of a world without distributions, and without what images do not
-    show."""
+    """Returns the sampled configuration of a world without the voxel size, which is not visible."""
     drawn = sample_distributions(world, seed, ("world",))
     if not hasattr(drawn, "voxel_size"):
         return drawn
@@ -255,10 +241,11 @@ def _poses_on_path(esdf: Esdf, config: RenderConfig) -> list[RigidTransform]:
 
 
 def _plan(esdf: Esdf, config: RenderConfig) -> CapturePlan:
+    size = config.width, config.height
     plan = plan_capture(
         esdf,
-        _intrinsics(config),
-        (config.width, config.height),
+        intrinsics(*size),
+        size,
         (config.lowest, config.highest),
         config.clearance,
         config.views,
@@ -296,6 +283,11 @@ def _plan(esdf: Esdf, config: RenderConfig) -> CapturePlan:
     return plan
 
 
+def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    with written_atomically(path) as file:
+        file.write_bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+
+
 def _is_free(esdf: Esdf, p_WQ: NDArray, clearance: float) -> bool:
     # Outside the grid, where distance is NaN, all is free.
     return not esdf.distance(p_WQ) < clearance
@@ -311,18 +303,15 @@ def _write_frames(
     images, depths = folder / "image_left", folder / "depth_left"
     for part in (images, depths):
         require_writable_folder(part)
+    R_FW, R_CB = (RigidTransform(each.inverse()) for each in (AXES.R_WF, AXES.R_BC))
     rows = []
     for i, X_WC in enumerate(Progress(X_WCs, what, unit="frame")):
-        R_FW = RigidTransform(AXES.R_WF.inverse())
-        rows.append(f"{pose_row(R_FW @ X_WC @ RigidTransform(AXES.R_BC.inverse()))}\n")
-        image = images / f"{i:06d}_left.png"
-        depth = depths / f"{i:06d}_left_depth.npy"
+        rows.append(f"{pose_row(R_FW @ X_WC @ R_CB)}\n")
+        image, depth = images / f"{i:06d}_left.png", depths / f"{i:06d}_left_depth.npy"
         if image.is_file() and depth.is_file():
             continue
         frame = view(X_WC)
         with written_atomically(depth) as file:
             np.save(file, frame.depth)
-        with written_atomically(image) as file:
-            _, content = cv2.imencode(".png", np.ascontiguousarray(frame.image[..., ::-1]))
-            file.write_bytes(content.tobytes())
+        _write_png(image, frame.image)
     write_text(folder / "pose_left.txt", "".join(rows))

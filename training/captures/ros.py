@@ -1,11 +1,9 @@
 """ROS bags, of ROS 1 (`.bag`) or ROS 2 (a folder with `metadata.yaml`), as RGB-D sequences.
 
 A bag has topics of color images, of depth images in their pixels (16UC1 in millimeters or 32FC1 in
-meters), of the calibration of the color camera, and of poses. Poses are those of the only topic of
-`PoseStamped`, `PoseWithCovarianceStamped`, `TransformStamped` or `Odometry`, of the body that
-`child_frame_id` names, if it names one, moved to the frame of the images by `/tf_static`; without
-such a topic they are those of `/tf`, from its root to that frame. Images and poses are written to
-the cache once, in TUM's format.
+meters), of the calibration of the color camera, and of poses: the only topic of `_POSES`, of the
+body that `child_frame_id` may name, moved to the frame of the images by `/tf_static`, or else
+`/tf`, from its root to that frame. All is written to the cache once, in TUM's format.
 """
 
 import json
@@ -115,15 +113,13 @@ class _Bag:
     def __init__(self, path: Path, reader: Any, topics: list[str]):
         self._path, self._reader = path, reader
         self._types = {c.topic: c.msgtype for c in reader.connections}
-        shown = {topic: self._content(topic) for topic in self._topics(*_IMAGES)}
-        colors, depths = (
-            [topic for topic, content in shown.items() if content == name]
-            for name in ("color", "depth")
-        )
+        shown: dict[str, list[str]] = {"color": [], "depth": [], "": []}
+        for topic in self._topics(*_IMAGES):
+            shown[self._content(topic)].append(topic)
         poses = self._topics(*_POSES) or [t for t in self._topics(_TF) if t != "/tf_static"]
         given = topics or ["", "", ""]
-        self._color = self._choose("color images", colors, given[0], _IMAGES)
-        self._depth = self._choose("depth images", depths, given[1], _IMAGES)
+        self._color = self._choose("color images", shown["color"], given[0], _IMAGES)
+        self._depth = self._choose("depth images", shown["depth"], given[1], _IMAGES)
         self._pose = self._choose("poses", poses, given[2], (*_POSES, _TF))
 
     def write(self, folder: Path) -> None:
@@ -140,9 +136,11 @@ class _Bag:
                 body = getattr(message, "child_frame_id", "").lstrip("/")
                 X_BC = tree.fixed_pose(body, frame) if body else RigidTransform()
                 if X_BC is None:
-                    what = f"{self._path}: {body!r}, whose poses are in {self._pose},"
-                    condition = f"connected by /tf_static with {frame!r}, of {self._color}"
-                    require(False, what, condition, "no transform", "record it in the bag")
+                    raise ValueError(
+                        f"{self._path}: {body!r}, whose poses are in {self._pose}, must be "
+                        f"connected by /tf_static with {frame!r}, of {self._color}, got no "
+                        "transform; record it in the bag"
+                    )
                 poses.append((_time(message), _pose(pose_field(message), self._pose) @ X_BC))
         what = f"{self._path}: poses of {frame!r}, the frame of {self._color}, in {self._pose}"
         require(len(poses) >= 2, what, "at least 2", len(poses))
@@ -223,16 +221,13 @@ class _Bag:
         return times
 
     def _calibration(self, frame: str) -> dict[str, Any]:
-        """Returns the calibration of the color images, which are in `frame`, or the problem. It is
-        in the namespace of the images or, without one there, has their frame. K and D describe
-        images as the camera took them, P those that are rectified (CameraInfo)."""
+        """Returns the calibration in the namespace of the color images or else of their `frame`, or
+        the problem. K and D describe images as taken, P rectified ones (CameraInfo)."""
         images = self._color
         for transport in _TRANSPORTS:
             images = images.removesuffix(transport)
         namespace, _, image = images.rpartition("/")
-        infos = {
-            topic: info for topic in self._topics(_INFO) if (info := self._first(topic)) is not None
-        }
+        infos = {topic: info for topic in self._topics(_INFO) if (info := self._first(topic))}
         near = [topic for topic in infos if topic.rpartition("/")[0] == namespace]
         found = near or [topic for topic, info in infos.items() if _frame(info) == frame]
         if not found:
@@ -283,8 +278,7 @@ class TransformTree:
         return _compose(map(self._fixed.get, names[: names.index(ancestor)]))
 
     def pose(self, frame: str, time: float) -> RigidTransform | None:
-        """Returns the pose of a frame in its root at a time [s], None if the poses around it are
-        missing or too far apart."""
+        """Returns the pose of a frame in its root at a time [s]; None if it is unknown then."""
         *names, root = self._upwards(frame)
         if root in self._parents:
             return None

@@ -39,12 +39,9 @@ def recognizes_scannet(path: Path) -> bool:
 
 
 def read_scannet(path: Path, config: CaptureConfig) -> Capture:
-    """Opens a folder as ScanNet's reader exports it (Dai et al., "ScanNet", CVPR 2017).
-
-    `color/0.jpg`, `depth/0.png` in millimeters, `pose/0.txt` 4x4, camera to world with z up, -inf
-    where tracking was lost, `intrinsic/intrinsic_color.txt` and `intrinsic_depth.txt` 4x4, counted
-    from the first pixel's center. The axes of both cameras are the same.
-    """
+    """Opens a folder as ScanNet's reader exports it (Dai et al., "ScanNet", CVPR 2017): depth in
+    millimeters; poses 4x4, camera to world with z up, -inf where tracking was lost; intrinsics 4x4,
+    counted from the first pixel's center. The axes of both cameras are the same."""
     colors = frames.numbered_files(path / "color", r"(\d+)\.(?:jpg|jpeg|png)")
     lost = set()
     for number in colors:
@@ -58,12 +55,8 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
         K_D = _intrinsics(path / _SCANNET_DEPTH)
 
     def frame(number: int, color: Path) -> frames.FrameFiles:
-        pose, depth = path / "pose" / f"{number}.txt", path / "depth" / f"{number}.png"
-        return frames.FrameFiles(
-            color,
-            lambda: frames.pose_from_matrix(frames.read_matrix(pose), str(pose)),
-            depth if depth.is_file() else None,
-        )
+        depth = frames.first_file(path / "depth" / f"{number}.png")
+        return frames.FrameFiles(color, lambda: _pose(path / "pose" / f"{number}.txt"), depth)
 
     def depth_camera(width: int, height: int) -> DepthCamera:
         return DepthCamera(Lens(K_D, width, height).K, width, height, RigidTransform())
@@ -80,39 +73,34 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
     )
 
 
+def _pose(file: Path) -> RigidTransform:
+    return frames.pose_from_matrix(frames.read_matrix(file), str(file))
+
+
 def _intrinsics(file: Path) -> NDArray[np.float64]:
     K = frames.read_matrix(file)
     return centered_pinhole(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
 def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
-    """Opens a folder as 7-Scenes (Shotton et al., CVPR 2013): `frame-%06d.color.png`,
-    `.depth.png` in millimeters with 0 and 65535 invalid, `.pose.txt` 4x4, depth camera to world.
-
-    `config.intrinsics` and `depth_intrinsics`, if equal and with `p_DC` zero, describe depth that
-    is registered to color.
-    """
+    """Opens a folder as 7-Scenes (Shotton et al., CVPR 2013): depth in millimeters with 0 and 65535
+    invalid; poses 4x4, depth camera to world. Equal `config.intrinsics` and `depth_intrinsics`,
+    with `p_DC` zero, describe registered depth."""
     colors = frames.numbered_files(path, r"frame-(\d+)\.color\.(?:jpg|jpeg|png)")
     X_DC = RigidTransform(np.array(config.p_DC or _P_DC))
 
     def frame(color: Path) -> frames.FrameFiles:
         stem = color.name.partition(".")[0]
-        pose = path / f"{stem}.pose.txt"
-        return frames.FrameFiles(
-            color,
-            lambda: frames.pose_from_matrix(frames.read_matrix(pose), str(pose)) @ X_DC,
-            path / f"{stem}.depth.png",
-        )
+        depth = path / f"{stem}.depth.png"
+        return frames.FrameFiles(color, lambda: _pose(path / f"{stem}.pose.txt") @ X_DC, depth)
 
     def lens(width: int, height: int) -> Lens:
         source = "a measurement on redkitchen; set capture.intrinsics for another camera"
         return Lens(pinhole(*_SEVEN_SCENES_COLOR), 640, 480, source=source).scale_to(width, height)
 
     def depth_camera(width: int, height: int) -> DepthCamera:
-        if config.depth_intrinsics:
-            K = pinhole(*config.depth_intrinsics)
-        else:
-            K = Lens(pinhole(*_SEVEN_SCENES_DEPTH), 640, 480).scale_to(width, height).K
+        K = Lens(pinhole(*_SEVEN_SCENES_DEPTH), 640, 480).scale_to(width, height).K
+        K = pinhole(*config.depth_intrinsics) if config.depth_intrinsics else K
         return DepthCamera(K, width, height, X_DC.inverse())
 
     return frames.open_frames(
@@ -131,13 +119,10 @@ _METADATA = "metadata.json"
 
 
 def read_polycam(path: Path, config: CaptureConfig) -> Capture:
-    """Opens the raw data of a LiDAR capture of Polycam, as it documents them.
-
-    `keyframes/` holds `images/`, `depth/` and `cameras/`, a JSON file per keyframe with `fx`, `fy`,
-    `cx`, `cy`, `width`, `height` [px] and the entries `t_00` to `t_23` of the pose, from camera
-    axes of OpenGL to a world with y up; depth is in millimeters, in fewer pixels than the image.
-    `corrected_cameras/` and `corrected_images/` hold optimized poses and undistorted images.
-    """
+    """Opens the raw data of a LiDAR capture of Polycam, as it documents them: `t_00` to `t_23` of a
+    keyframe are its pose, from camera axes of OpenGL to a world with y up; depth is in millimeters,
+    in fewer pixels than the image; `corrected_` folders hold optimized poses and undistorted
+    images."""
     folder = path / "keyframes"
     prefix = "corrected_" if (folder / "corrected_cameras").is_dir() else ""
 
@@ -152,16 +137,12 @@ def read_polycam(path: Path, config: CaptureConfig) -> Capture:
             read = _read_keyframe(camera, image, config.intrinsics)
         except ValueError as error:
             read = error
-        depth = folder / "depth" / f"{camera.stem}.png"
         lens = None if isinstance(read, ValueError) else read[0]
-        confidence = folder / "confidence" / f"{camera.stem}.png"
-        return frames.FrameFiles(
-            image,
-            X_FB,
-            depth if depth.is_file() else None,
-            lens,
-            confidence=confidence if confidence.is_file() else None,
+        depth, confidence = (
+            frames.first_file(folder / name / f"{camera.stem}.png")
+            for name in ("depth", "confidence")
         )
+        return frames.FrameFiles(image, X_FB, depth, lens, confidence=confidence)
 
     pattern = r"(\d+)\.json"
     cameras = frames.numbered_files(folder / f"{prefix}cameras", pattern)
@@ -205,13 +186,10 @@ def recognizes_record3d(path: Path) -> bool:
 
 
 def read_record3d(path: Path, config: CaptureConfig) -> Capture:
-    """Opens an export "EXR + RGB" of Record3D: `metadata.json`, `rgb/0.jpg`, `depth/0.exr`.
-
-    As the application's author documents it, `poses` holds a row qx qy qz qw tx ty tz per frame,
-    from camera axes of OpenGL to the first camera's, so that up is unknown; `K` holds the
-    intrinsics column by column for images of `w` x `h`, and `perFrameIntrinsicCoeffs`, in newer
-    exports, fx fy cx cy of each frame; depth is in meters, in fewer pixels than the image.
-    """
+    """Opens an export "EXR + RGB" of Record3D, as its author documents it: `poses` are rows qx qy
+    qz qw tx ty tz, from camera axes of OpenGL to the first camera's, so that up is unknown; `K` is
+    stored column by column for images of `w` x `h`; `perFrameIntrinsicCoeffs`, in newer exports,
+    are rows fx fy cx cy; depth is in meters, in fewer pixels than the image."""
     if path.suffix == ".r3d":
         raise ValueError(
             f"{path}: Record3D's own format, whose depth is compressed; export the recording as "
@@ -240,11 +218,10 @@ def read_record3d(path: Path, config: CaptureConfig) -> Capture:
         values = np.array(config.intrinsics) if config.intrinsics else intrinsics[i]
         source = "capture.intrinsics" if config.intrinsics else _METADATA
         lens = Lens(pinhole(*values), *size, source=source)
-        depth, pose = path / "depth" / f"{i}.exr", np.roll(poses[i], 3)
         return frames.FrameFiles(
             image,
-            lambda: frames.pose_from_quaternion(pose, f"{file}, frame {i}"),
-            depth if depth.is_file() else None,
+            lambda: frames.pose_from_quaternion(np.roll(poses[i], 3), f"{file}, frame {i}"),
+            frames.first_file(path / "depth" / f"{i}.exr"),
             lenses.setdefault(values.tobytes(), lens),
         )
 

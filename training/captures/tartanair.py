@@ -1,16 +1,16 @@
 """TartanAir sequences, V1 (`image_left/`, ...) and V2 (`image_lcam_front/`, ...).
 
-Layout and conventions as published with the data sets (Wang et al., "TartanAir: A Dataset to Push
-the Limits of Visual SLAM", IROS 2020, and TartanAir V2 after it). One line `tx ty tz qx qy qz qw` a
-frame is the pose of a body (x forward, y right, z down) whose camera looks along x, in a
-north-east-down world; the horizontal field of view is 90 degrees; depth is in meters along the
-optical axis, in V1 an array of float32, in V2 a PNG whose four channels are the bytes of a float32.
+As published (Wang et al., "TartanAir: A Dataset to Push the Limits of Visual SLAM", IROS 2020): one
+line `tx ty tz qx qy qz qw` a frame is the pose of a body (x forward, y right, z down) whose camera
+looks along x, in a north-east-down world; images are 90 degrees wide; depth [m] is along the
+optical axis, in V1 an array, in V2 a PNG whose four channels are the bytes of a float32.
 """
 
 import re
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
 from splatpilot.training.captures import frames
@@ -31,6 +31,11 @@ def recognizes(path: Path, version: str) -> bool:
     """Tells whether a folder looks like a TartanAir sequence of "V1" or "V2", complete or not."""
     camera = _CAMERAS[version]
     return (path / f"pose_{camera}.txt").exists() or (path / f"image_{camera}").is_dir()
+
+
+def intrinsics(width: int, height: int) -> NDArray[np.float64]:
+    """Returns the intrinsics (3, 3) [px] of a camera 90 degrees wide."""
+    return pinhole(width / 2, width / 2, width / 2, height / 2)
 
 
 def read(path: Path, config: CaptureConfig, version: str) -> Capture:
@@ -61,17 +66,13 @@ def read(path: Path, config: CaptureConfig, version: str) -> Capture:
             depths.get(number, depth_folder / f"{name}_{suffix}"),
         )
 
-    def lens(width: int, height: int) -> Lens:
-        K = pinhole(width / 2, width / 2, width / 2, height / 2)
-        return Lens(K, width, height, source="TartanAir's 90 degrees of width")
-
     return frames.open_frames(
         path,
         f"TartanAir {version} sequence",
         [frame(number, i) for i, number in enumerate(numbers)],
         axes=AXES,
         config=config,
-        lens=lens,
+        lens=lambda *size: Lens(intrinsics(*size), *size, source="TartanAir's 90 degrees of width"),
         depth_unit=1.0,
         read_depth=frames.read_depth if version == "V1" else frames.read_packed_depth,
         dropped=extra,

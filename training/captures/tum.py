@@ -1,10 +1,9 @@
 """RGB-D sequences in TUM's format: `rgb.txt`, `depth.txt`, `groundtruth.txt` with time stamps.
 
-Layout, intrinsics and the 5000 units per meter as published with the data set (Sturm et al., "A
-Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012). Depth is registered to color;
-poses `tx ty tz qx qy qz qw` are those of the optical axes in a world with z up. A color image takes
-the depth nearest in time, and a pose interpolated between two measured ones or, where poses are
-those of keyframes, the pose of its own time.
+As published (Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012),
+depth is registered to color; poses `tx ty tz qx qy qz qw` are of the optical axes in a world with z
+up. A color image takes the depth nearest in time, and a pose interpolated between two or, of a
+keyframe, that of its own time.
 """
 
 import re

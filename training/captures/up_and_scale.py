@@ -30,12 +30,9 @@ _MAX_SPREAD = 0.25  # of the cameras' heights over a ground, 10 to 90 %, relativ
 
 
 def up_of_cameras(X_WCs: Sequence[RigidTransform]) -> NDArray[np.float64]:
-    """Returns the up direction (3,) of cameras that are held level.
-
-    Level images have horizontal x axes, so up is the direction most nearly at right angles to all
-    of them and, where that leaves a choice, nearest to the mean m of the cameras' own up: the
-    eigenvector of the smallest eigenvalue of sum x x^T + 0.01 sum (I - m m^T).
-    """
+    """Returns the up direction (3,) of cameras that are held level: at right angles to their x axes
+    and near the mean m of their own up, the eigenvector of the smallest eigenvalue of
+    sum x x^T + 0.01 sum (I - m m^T)."""
     R = np.array([X_WC.rotation().matrix() for X_WC in X_WCs])
     mean = -R[:, :, 1].mean(axis=0)
     if np.linalg.norm(mean) < 0.1:
@@ -56,8 +53,8 @@ def fit_ground(
     """Fits the ground plane n.p = d to points (N, 3), and returns n (3,), upward, and d.
 
     Of planes through three random points, within 35 degrees of `up` and below the median camera,
-    the one with the most points near it wins; a point below it counts against it. Near is 2 % of
-    the cameras' median distance from the points. The winner is refined by least squares.
+    the one with the most points within 2 % of the median distance wins, less those below it; it is
+    refined by least squares.
     """
     rng = np.random.default_rng(0)
     camera = np.median(p_WCs, axis=0)
@@ -160,8 +157,7 @@ def make_metric(
     locate: Callable[[str, NDArray[np.float64]], NDArray[np.float64]] | None = None,
 ) -> Capture:
     """Scales poses and points in unknown units to meters, or marks the capture as not metric.
-    `locate` returns the point (3,) that the image of a name shows at a pixel (2,), or raises
-    ValueError; None if pixels cannot be located."""
+    `locate`, if given, returns the point (3,) that the image of a name shows at a pixel (2,)."""
     sources = scale.sources()
     if not sources:
         return dataclasses.replace(capture, metric=False)
@@ -207,8 +203,7 @@ def _locate(
 
 
 def camera_height(capture: Capture) -> float:
-    """Returns the median height of the cameras above the ground, in the capture's units, if they
-    were carried level at one height."""
+    """Returns the median height of level cameras above the ground, in the capture's units."""
     cameras = np.array([X_WC.translation() for X_WC in capture.X_WCs])
     up = up_of_cameras(capture.X_WCs)
     n, d = fit_ground(_known_points(capture), cameras, up)
@@ -225,11 +220,11 @@ def camera_height(capture: Capture) -> float:
 
 
 def _factor_from_depth(capture: Capture) -> float:
-    """Returns the median ratio of measured depth to that of the points, over all images with depth.
-    A point that is hidden in an image has a ratio too small; the median bears fewer than half."""
+    """Returns the median ratio of measured depth to that of the points: hidden points have a ratio
+    too small."""
     ratios = [np.zeros(0)]
     points = capture.points.p_WQ if capture.points is not None else np.zeros((0, 3))
-    for i in range(len(capture) if capture.has_depth and len(points) else 0):
+    for i in range(len(capture)):
         p_CQ = capture.X_WCs[i].inverse().multiply(points.T).T
         inside, rows, columns = project_points(capture.K, p_CQ, capture.width, capture.height)
         measured = capture.registered_depth(i)[rows, columns]
@@ -246,8 +241,7 @@ def _factor_from_depth(capture: Capture) -> float:
 
 def move_origin(capture: Capture, origin: Sequence[float]) -> Capture:
     """Returns the capture in a world whose origin is at `origin` (3,) of its present one; if empty,
-    in the middle of cameras that are far away. Gaussians are in single precision, in which a step
-    is 0.06 m at 800 km."""
+    in the middle of cameras that are too far away for single precision."""
     p_WCs = np.array([X_WC.translation() for X_WC in capture.X_WCs])
     p = np.array(origin, dtype=np.float64) if origin else choose_origin(p_WCs)
     if not p.any():
