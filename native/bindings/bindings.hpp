@@ -24,8 +24,15 @@ template <typename... Shape>
 using Floats = Array<const float, Shape...>;
 template <typename... Shape>
 using Doubles = Array<const double, Shape...>;
+// An array that a function writes. Python's must have the right type: a converted copy would be
+// written in its place.
+template <typename T, typename... Shape>
+struct Written : Array<T, Shape...> {
+  Written() = default;
+  explicit Written(const Array<T, Shape...>& array) : Array<T, Shape...>(array) {}
+};
 template <typename... Shape>
-using Writable = Array<float, Shape...>;
+using Writable = Written<float, Shape...>;
 using Indices = Array<const int64_t, nb::ndim<1>>;
 using Values = Floats<nb::ndim<1>>;
 using ValuesOut = Writable<nb::ndim<1>>;
@@ -164,3 +171,18 @@ void bind_grids(nb::module_& m);
 void bind_flight(nb::module_& m);
 
 }  // namespace splatpilot
+
+template <typename T, typename... Shape>
+struct nanobind::detail::type_caster<splatpilot::Written<T, Shape...>> {
+  using Caster = make_caster<splatpilot::Array<T, Shape...>>;
+  using Array = splatpilot::Written<T, Shape...>;
+  NB_TYPE_CASTER(Array, Caster::Name)
+
+  bool from_python(handle source, uint32_t flags, cleanup_list* cleanup) noexcept {
+    Caster caster;
+    const uint32_t exact = flags & ~static_cast<uint32_t>(cast_flags::convert);
+    if (!caster.from_python(source, exact, cleanup)) return false;
+    value = Array(caster.value);
+    return true;
+  }
+};

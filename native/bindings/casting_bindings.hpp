@@ -19,8 +19,8 @@ using Points = Rows3;
 using Rotations = Floats<nb::shape<-1, 3, 3>>;
 using DepthRows = Writable<nb::ndim<2>>;
 using QueryPoints = Doubles<nb::shape<-1, 3>>;
-using Distances = Array<double, nb::ndim<1>>;
-using Gradients = Array<double, nb::shape<-1, 3>>;
+using Distances = Written<double, nb::ndim<1>>;
+using Gradients = Written<double, nb::shape<-1, 3>>;
 using Grid = Floats<nb::ndim<3>>;
 using Point = Doubles<nb::shape<3>>;
 

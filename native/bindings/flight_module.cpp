@@ -24,12 +24,12 @@ namespace {
 using DoubleRows = Doubles<nb::shape<-1, kShapeSize>>;
 using Kinds = Array<const uint8_t, nb::ndim<1>>;
 using VoxelStates = Array<const uint8_t, nb::ndim<3>>;
-using FieldStates = Array<uint8_t, nb::ndim<1>>;
+using FieldStates = Written<uint8_t, nb::ndim<1>>;
 using Numbers = Doubles<nb::ndim<1>>;
 using Rows = Doubles<nb::ndim<2>>;
 using Packs = Doubles<nb::shape<-1, kFlightParameters, kPackVehicles>>;
 using Flags = Array<const bool, nb::ndim<1>>;
-using Counts = Array<int32_t, nb::ndim<1>>;
+using Counts = Written<int32_t, nb::ndim<1>>;
 
 const std::vector<std::string> kParameterNames = {
     "drag",         "rate_gain",    "yaw_rate_gain",    "gravity",       "motor_gain",
@@ -112,8 +112,8 @@ enum End : uint8_t { kInFlight, kCollision, kLeftVolume, kGoal, kTimeout };
 
 // Vehicles in worlds; rows are those of N vehicles.
 struct Vehicles {
-  Array<double, nb::shape<-1, kStateSize>> states;
-  Array<double, nb::ndim<1>> thrusts;
+  Written<double, nb::shape<-1, kStateSize>> states;
+  Written<double, nb::ndim<1>> thrusts;
   Packs parameters;  // by packs of vehicles
   Indices world;
   QueryPoints goals;
@@ -257,7 +257,7 @@ class FlightThreads {
 
 void command(const std::string& kind, const Doubles<nb::shape<kStateSize>>& state,
              const Numbers& action, const Doubles<nb::shape<kFlightParameters>>& parameters,
-             const Array<double, nb::shape<4>>& command) {
+             const Written<double, nb::shape<4>>& command) {
   static const FlightKernels& kernels_of_machine = *kernels("").flight;
   const ActionKind known = action_kind(kind);
   require(action.size() == (known == ActionKind::kCommand ? 4 : 3),
@@ -269,7 +269,7 @@ using Vector3d = Doubles<nb::shape<3>>;
 
 void derivatives(const Doubles<nb::shape<kStateSize>>& state, const Doubles<nb::shape<4>>& command,
                  double drag, double rate_time_constant, double gravity,
-                 const Array<double, nb::shape<kStateSize>>& rates,
+                 const Written<double, nb::shape<kStateSize>>& rates,
                  const std::optional<Vector3d>& wind, const std::optional<Vector3d>& disturbance) {
   SIMD_LEVEL::quadrotor_derivatives(state.data(), command.data(), drag, 1.0 / rate_time_constant,
                                     gravity, wind ? wind->data() : nullptr,
@@ -279,7 +279,7 @@ void derivatives(const Doubles<nb::shape<kStateSize>>& state, const Doubles<nb::
 // The state has the charge, whose rate is not written, before the thrust over mass.
 void actuated(const Doubles<nb::shape<kStateSize + 2>>& state, const Doubles<nb::shape<4>>& command,
               const Doubles<nb::shape<kFlightParameters>>& parameters,
-              const Array<double, nb::shape<kStateSize + 2>>& rates) {
+              const Written<double, nb::shape<kStateSize + 2>>& rates) {
   double lagged[kStateSize + 1], derivatives[kStateSize + 1];
   std::copy_n(state.data(), kStateSize, lagged);
   lagged[kLaggedThrust] = state.data()[kStateSize + 1];
@@ -310,8 +310,8 @@ void bind_flight(nb::module_& m) {
                        "packs\n(ceil(N / 16), len(FLIGHT_PARAMETERS), 16).")
       .def(
           "__init__",
-          [](Vehicles* self, const Array<double, nb::shape<-1, kStateSize>>& states,
-             const Array<double, nb::ndim<1>>& thrusts, const Packs& parameters,
+          [](Vehicles* self, const Written<double, nb::shape<-1, kStateSize>>& states,
+             const Written<double, nb::ndim<1>>& thrusts, const Packs& parameters,
              const Indices& world, const QueryPoints& goals, const Numbers& radii,
              const Numbers& goal_radii, const Counts& remaining, const Distances& distances,
              const FieldStates& field_states, const FieldStates& ends) {

@@ -14,7 +14,7 @@ namespace splatpilot {
 namespace {
 
 using Volume = Doubles<nb::ndim<3>>;
-using PathRows = Array<double, nb::shape<-1, 4>>;
+using PathRows = Written<double, nb::shape<-1, 4>>;
 using GridShapes = Array<const int64_t, nb::shape<-1, 3>>;
 using Vector = SIMD_LEVEL::Vector3<double>;
 
@@ -91,7 +91,7 @@ void grid_distances(const Grid& grid, const Point& lower_W, const Point& upper_W
 
 void travel_times(const Volume& front, const Volume& speed,
                   const Array<const bool, nb::ndim<3>>& blocked, double voxel_size,
-                  const Array<double, nb::ndim<3>>& times) {
+                  const Written<double, nb::ndim<3>>& times) {
   int64_t shape[3];
   for (size_t k = 0; k < 3; ++k) {
     shape[k] = static_cast<int64_t>(front.shape(k));
