@@ -91,14 +91,22 @@ def with_appearance(world: World, look: Appearance) -> World:
 
 
 def recolored(scene: GaussianScene, look: Appearance) -> GaussianScene:
-    """Returns the Gaussians in other colors. The base color is painted and lit again; the view
-    dependence scales with its brightness."""
+    """Returns the Gaussians, painted and lit again; their view dependence follows brightness."""
     before, normals = scene.base_colors, scene.normals  # (N, 3)
     after = np.empty_like(before)
+    spacing = 1 / (_PAINTS - 1)
+    grid = np.full(3, -0.5 * spacing), spacing
+    paints = np.moveaxis(look.paint, -1, 0).copy()
     for first in range(0, len(before), _BATCH):
         some = slice(first, first + _BATCH)
-        painted = np.clip(before[some] + _paint(before[some], look), 0, 1)
-        light = _light(scene.means[some], normals[some], look)
+        colors = before[some]
+        added = [interpolate_grid(p, *grid, colors, with_gradient=False)[0] for p in paints]
+        painted = np.clip(colors + np.stack(added, axis=1).astype(np.float32), 0, 1)
+        # A Gaussian is lit alike from both sides. |cos| is 1/2 on average.
+        facing = 2 * np.abs(normals[some] @ look.light_W)
+        phases = look.waves[:, :3] @ scene.means[some].T + look.waves[:, 3:]  # (5, N)
+        mottled = 1 + look.mottle * np.cos(phases).sum(axis=0) / np.sqrt(_WAVES)
+        light = (1 - look.relief + look.relief * facing) * mottled
         linear = painted**GAMMA * (look.exposure * light)[:, None]
         after[some] = _to_srgb(linear @ look.mixing.T)
     sh = scene.sh.copy()
@@ -119,24 +127,6 @@ def recolored_background(background: Background, look: Appearance) -> Background
     if isinstance(background, EnvironmentMap):
         return EnvironmentMap(recolor(background.texels))
     return tuple(recolor(np.asarray(background, np.float32)).tolist())
-
-
-def _paint(colors: Array, look: Appearance) -> Array:
-    """Returns the change of sRGB colors (N, 3), equal for equal colors: materials stay uniform."""
-    spacing = 1 / (_PAINTS - 1)
-    lower = np.full(3, -0.5 * spacing)
-    grids = np.moveaxis(look.paint, -1, 0).copy()
-    added = [interpolate_grid(g, lower, spacing, colors, with_gradient=False)[0] for g in grids]
-    return np.stack(added, axis=1).astype(np.float32)
-
-
-def _light(means: Array, normals: Array, look: Appearance) -> Array:
-    """Computes the relative light (N,) on Gaussians at `means` (N, 3) [m], 1 on average."""
-    # A Gaussian is lit alike from both sides. |cos| is 1/2 on average.
-    facing = 2 * np.abs(normals @ look.light_W)
-    phases = look.waves[:, :3] @ means.T + look.waves[:, 3:]  # (5, N)
-    mottled = np.cos(phases).sum(axis=0)
-    return (1 - look.relief + look.relief * facing) * (1 + look.mottle * mottled / np.sqrt(_WAVES))
 
 
 def _to_srgb(linear: NDArray) -> Array:

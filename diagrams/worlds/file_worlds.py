@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
 from splatpilot.diagrams.worlds.building_blocks import MAX_VOXELS
@@ -28,7 +27,7 @@ from splatpilot.diagrams.worlds.solids.textures import (
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.octomap import Octomap, read_octomap
+from splatpilot.systems.collision.octomap import read_octomap
 from splatpilot.systems.common.files import find_data
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import (
@@ -68,7 +67,18 @@ def octomap_world(config: OctomapConfig, seed: int) -> World:
     """Reads the map of `config`, colored by height."""
     path = find_scene(config)
     octomap = read_octomap(path)
-    lower_W, upper_W = _flown_part(config, octomap)
+    if config.lower is not None and config.upper is not None:
+        lower_W, upper_W = np.array(config.lower, float), np.array(config.upper, float)
+    else:
+        lower_W, upper_W = octomap.part(MAX_VOXELS)
+        corners = (lower_W, upper_W, octomap.lower_W, octomap.upper_W)
+        if (upper_W - lower_W < octomap.upper_W - octomap.lower_W).any():
+            _log.warning(
+                "%s is large: using the part from %s to %s of %s to %s m; world.lower and "
+                "world.upper choose another",
+                config.path,
+                *(corner.round(1).tolist() for corner in corners),
+            )
     with errors_about(path):
         esdf = octomap.esdf(lower_W, upper_W)
     if not (esdf.states == FieldState.FREE).any():
@@ -81,21 +91,6 @@ def octomap_world(config: OctomapConfig, seed: int) -> World:
     hour = Daylight.sample(np.random.default_rng([seed, 1]))
     name, haze = Path(config.path).stem, tuple(hour.haze.tolist())
     return World(name, voxel_gaussians(esdf, hour), esdf, esdf, haze, *ends)
-
-
-def _flown_part(config: OctomapConfig, octomap: Octomap) -> tuple[NDArray, NDArray]:
-    """Returns the corners (3,) [m] of the part to fly in; warns if it is not all."""
-    if config.lower is not None and config.upper is not None:
-        return np.array(config.lower, float), np.array(config.upper, float)
-    lower_W, upper_W = octomap.part(MAX_VOXELS)
-    if (upper_W - lower_W < octomap.upper_W - octomap.lower_W).any():
-        _log.warning(
-            "%s is large: using the part from %s to %s of %s to %s m; world.lower and world.upper "
-            "choose another",
-            config.path,
-            *(c.round(1).tolist() for c in (lower_W, upper_W, octomap.lower_W, octomap.upper_W)),
-        )
-    return lower_W, upper_W
 
 
 def voxel_gaussians(esdf: Esdf, hour: Daylight) -> GaussianScene:

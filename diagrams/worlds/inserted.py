@@ -62,11 +62,28 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
             continue
         esdf = _merge(scene.esdf, solids)
         if _leaves_route(esdf, scene.p_WS, scene.p_WG, config.gap):
-            return _insert(scene, solids, esdf, seed)
-    raise InfeasibleFlightError(
-        f"{config.path}: none of {TRIES} draws of {config.least} to {config.most} solids leaves a "
-        f"route of {config.gap:.2f} m width from start to goal; use a smaller gap or fewer solids"
-    )
+            break
+    else:
+        raise InfeasibleFlightError(
+            f"{config.path}: none of {TRIES} draws of {config.least} to {config.most} solids "
+            f"leaves a route of {config.gap:.2f} m width from start to goal; use a smaller gap or "
+            "fewer solids"
+        )
+    # Lit from above.
+    middle = (scene.p_WS + scene.p_WG) / 2
+    lamps = np.stack([scene.p_WS, middle, scene.p_WG]) + np.array([0, 0, 1.5])
+    light = Lamplight(lamps, np.ones(3), esdf)
+    name, ends = f"{scene.name}_inserted", (scene.p_WS, scene.p_WG)
+    box = esdf.lower_W, esdf.upper_W
+    spec = WorldSpec(name, *box, solids, *ends, light=lambda _: light, seed=seed)
+    gaussians = draw(spec, solids, light).merged_with(scene.gaussians)  # the frontier stays last
+    observations = scene.observations
+    if observations is not None:
+        spacing = observations.voxel_size
+        surfaces = np.concatenate([_surface(solid.shape, spacing) for solid in solids])
+        observations = observations.with_surfaces(surfaces)
+    field = {"esdf": esdf, "distance_field": esdf}
+    return replace(scene, name=name, gaussians=gaussians, observations=observations, **field)
 
 
 def _draw_solids(config: InsertedConfig, world: World, rng: np.random.Generator) -> list[Solid]:
@@ -138,21 +155,3 @@ def _leaves_route(esdf: Esdf, p_WS: NDArray, p_WG: NDArray, gap: float) -> bool:
         box = tuple(slice(max(c - reach, 0), c + reach + 1) for c in cell)
         parts.append(set(np.unique(part[box])) - {0})
     return bool(parts[0] & parts[1])
-
-
-def _insert(world: World, solids: list[Solid], esdf: Esdf, seed: int) -> World:
-    """Returns the world with solids in it, lit from above."""
-    middle = (world.p_WS + world.p_WG) / 2
-    lamps = np.stack([world.p_WS, middle, world.p_WG]) + np.array([0, 0, 1.5])
-    light = Lamplight(lamps, np.ones(3), esdf)
-    name, ends = f"{world.name}_inserted", (world.p_WS, world.p_WG)
-    box = esdf.lower_W, esdf.upper_W
-    spec = WorldSpec(name, *box, solids, *ends, light=lambda _: light, seed=seed)
-    gaussians = draw(spec, solids, light).merged_with(world.gaussians)  # the frontier stays last
-    observations = world.observations
-    if observations is not None:
-        spacing = observations.voxel_size
-        surfaces = np.concatenate([_surface(solid.shape, spacing) for solid in solids])
-        observations = observations.with_surfaces(surfaces)
-    field = {"esdf": esdf, "distance_field": esdf}
-    return replace(world, name=name, gaussians=gaussians, observations=observations, **field)

@@ -10,7 +10,6 @@ from splatpilot.diagrams.worlds.building_blocks import daylight, ground
 from splatpilot.diagrams.worlds.forest.forest import trees_around
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, build, draw
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan, even_directions
-from splatpilot.diagrams.worlds.solids.textures import Illumination
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.shapes import MovingSpheres, Sphere
 from splatpilot.systems.common.validation import Config, bounded, require_field
@@ -200,17 +199,13 @@ def dodgedrone_world(config: DodgeDroneConfig, seed: int) -> World:
     world = build(spec)
     spheres = MovingSpheres([o.radius for o in moving], [o.path for o in moving], PERIOD)
     sun = light(world.esdf)
-    bodies = [_draw_body(o, spec, sun) for o in moving]
+    # A large volume, since they are seen from all sides.
+    large = {"lower_W": spec.lower_W - 100.0, "upper_W": spec.upper_W + 100.0}
+    bodies = []
+    for obstacle in moving:  # about their centers, lit as at their first positions
+        present = obstacle.path[np.isfinite(obstacle.path).all(axis=1)]
+        center = present[0] if len(present) else spec.p_WS
+        solid = Solid(Sphere(center, obstacle.radius), _MOVING)
+        body = draw(replace(spec, solids=[solid], **large), [solid], sun)
+        bodies.append(replace(body, means=body.means - center.astype(np.float32)))
     return replace(world, moving=MovingObstacles(spheres, MovingGaussians(bodies, spheres.centers)))
-
-
-def _draw_body(obstacle: Obstacle, course: WorldSpec, light: Illumination) -> GaussianScene:
-    """Draws a moving sphere about its center, lit as at its first position."""
-    present = obstacle.path[np.isfinite(obstacle.path).all(axis=1)]
-    center = present[0] if len(present) else course.p_WS
-    solid = Solid(Sphere(center, obstacle.radius), _MOVING)
-    # A large volume, since it is seen from all sides.
-    lower_W, upper_W = course.lower_W - 100.0, course.upper_W + 100.0
-    alone = replace(course, solids=[solid], lower_W=lower_W, upper_W=upper_W)
-    body = draw(alone, [solid], light)
-    return replace(body, means=body.means - center.astype(np.float32))

@@ -155,10 +155,23 @@ _MAX_VOXEL = 0.25  # [m], at which a vehicle of 0.354 m radius still finds a rou
 
 
 def read_scene(path: str | Path, hatched: bool = False) -> World:
-    """Reads a scene folder, or a file of Gaussians alone, see `read_splats`."""
+    """Reads a scene folder, or a file of Gaussians alone, see `read_splats`, without which space
+    counts as free."""
     path = Path(path)
-    is_scene = path.is_dir() and sog_meta(path) is None
-    return read_scene_folder(path, hatched=hatched) if is_scene else _read_bare_gaussians(path)
+    if path.is_dir() and sog_meta(path) is None:
+        return read_scene_folder(path, hatched=hatched)
+    gaussians = read_splats(path)
+    # Outliers must not stretch the grid; beyond it all counts as occupied.
+    lower_W, upper_W = np.percentile(gaussians.means.astype(float), [1, 99], axis=0)
+    lower_W, upper_W = lower_W - 0.1, upper_W + 0.1
+    voxel_size = suitable_voxel(lower_W, upper_W)
+    extent = np.round(upper_W - lower_W, 1).tolist()
+    condition = f"small enough for voxels of {_MAX_VOXEL} m"
+    remedy = "crop far Gaussians away, or rescale with `splatpilot scene scale`"
+    require(voxel_size <= _MAX_VOXEL, f"{path}: extent", condition, f"{extent} m", remedy)
+    esdf = esdf_from_gaussians(gaussians, voxel_size, lower_W, upper_W)
+    ends = choose_ends(esdf, path)
+    return World(path.stem, gaussians, esdf, esdf, (0.0, 0.0, 0.0), *ends)
 
 
 def read_scene_folder(path: str | Path, *, metric: bool = True, hatched: bool = False) -> World:
@@ -185,18 +198,11 @@ def read_scene_folder(path: str | Path, *, metric: bool = True, hatched: bool = 
     what, condition = f"{path / 'scene.yaml'}: lower_W and upper_W", f"those of esdf.npz, {found}"
     valid = np.allclose(stated, found, atol=1e-6)
     require(valid, what, condition, stated, "the files are of different scenes")
-    background, ends = read_background(path, metadata), np.array([metadata.p_WS, metadata.p_WG])
-    file = path / OBSERVATIONS
-    return World(
-        metadata.name,
-        gaussians,
-        esdf,
-        esdf,
-        background,
-        *ends,
-        num_frontier=len(gaussians) - num_observed,
-        observations=Observations.load(file) if file.exists() else None,
-    )
+    ends, file = np.array([metadata.p_WS, metadata.p_WG]), path / OBSERVATIONS
+    observations = Observations.load(file) if file.exists() else None
+    further = {"num_frontier": len(gaussians) - num_observed, "observations": observations}
+    background = read_background(path, metadata)
+    return World(metadata.name, gaussians, esdf, esdf, background, *ends, **further)
 
 
 def read_background(path: Path, metadata: SceneMetadata) -> Background:
@@ -223,8 +229,7 @@ def write_scene_folder(
     path: str | Path, world: World, frontier: GaussianScene | None = None, **fields: Any
 ) -> SceneMetadata:
     """Writes `world` as a scene folder atomically, replacing a scene there; returns its metadata.
-    `esdf` is its distance field, the frontier is that of `close_frontier`, and `fields` are further
-    ones of `SceneMetadata`; numpy arrays become lists."""
+    The frontier is that of `close_frontier`; `fields` are further ones of `SceneMetadata`."""
     path = Path(path).absolute()
     check_scene_target(path)
     esdf = world.esdf
@@ -253,22 +258,6 @@ def write_scene_folder(
             shutil.copytree(path / CAPTURE, new / CAPTURE, copy_function=os.link)
         write_scene_metadata(new, metadata)
     return metadata
-
-
-def _read_bare_gaussians(path: Path) -> World:
-    """Builds a world from Gaussians alone: space without Gaussians counts as free."""
-    gaussians = read_splats(path)
-    # Outliers must not stretch the grid; beyond it all counts as occupied.
-    lower_W, upper_W = np.percentile(gaussians.means.astype(float), [1, 99], axis=0)
-    lower_W, upper_W = lower_W - 0.1, upper_W + 0.1
-    voxel_size = suitable_voxel(lower_W, upper_W)
-    extent = np.round(upper_W - lower_W, 1).tolist()
-    condition = f"small enough for voxels of {_MAX_VOXEL} m"
-    remedy = "crop far Gaussians away, or rescale with `splatpilot scene scale`"
-    require(voxel_size <= _MAX_VOXEL, f"{path}: extent", condition, f"{extent} m", remedy)
-    esdf = esdf_from_gaussians(gaussians, voxel_size, lower_W, upper_W)
-    ends = choose_ends(esdf, path)
-    return World(path.stem, gaussians, esdf, esdf, (0.0, 0.0, 0.0), *ends)
 
 
 @dataclass
@@ -356,29 +345,21 @@ def close_frontier(
     parts = []
     if hidden.any():
         parts.append(_draw(esdf, *frontier_faces(before, hidden)))
-    if beyond:
-        parts.append(_far_frontier(_FAR_VOXEL * esdf.voxel_size, *views))
+    if beyond:  # on a grid of all that images show
+        reach = 2.0 * max(float(image[image < FAR].max(initial=0.0)) for image in images)  # [m]
+        lower_W, upper_W = bounds_of_depth_images(*views, reach)
+        voxel_size = float(np.cbrt(np.prod(upper_W - lower_W) / _FAR_VOXELS))
+        voxel_size = max(_FAR_VOXEL * esdf.voxel_size, voxel_size)
+        far = esdf_from_depth_images(*views, lower_W, upper_W, voxel_size, reach)
+        unseen, before, _ = hidden_frontier(far, reachable_space(far, VEHICLE_RADIUS), *views)
+        parts.append(_draw(far, *frontier_faces(before, unseen)))
     if not parts:
         return esdf, None
     return with_obstacles(esdf, hidden), functools.reduce(GaussianScene.merged_with, parts)
 
 
-def _far_frontier(
-    voxel_size: float, images: Sequence[np.ndarray], K: np.ndarray, X_WCs: Sequence[RigidTransform]
-) -> GaussianScene:
-    """Draws the frontier of all that images show, on a grid of at least `voxel_size` [m]."""
-    reach = 2.0 * max(float(image[image < FAR].max(initial=0.0)) for image in images)  # [m]
-    lower_W, upper_W = bounds_of_depth_images(images, K, X_WCs, reach)
-    voxel_size = max(voxel_size, float(np.cbrt(np.prod(upper_W - lower_W) / _FAR_VOXELS)))
-    far = esdf_from_depth_images(images, K, X_WCs, lower_W, upper_W, voxel_size, reach)
-    reachable = reachable_space(far, VEHICLE_RADIUS)
-    hidden, before, _ = hidden_frontier(far, reachable, images, K, X_WCs)
-    return _draw(far, *frontier_faces(before, hidden))
-
-
 def _draw(esdf: Esdf, centers: NDArray[np.float64], normals: NDArray[np.float64]) -> GaussianScene:
-    """Draws faces (F, 3), (F, 3) of `frontier_faces` as one surfel per cell, of the same mean and
-    spread, so that it lies across the steps of a slanted frontier."""
+    """Draws faces of `frontier_faces` as one surfel per cell, of the same mean and spread."""
     _, cell = np.unique((centers // _CELL).astype(int), axis=0, return_inverse=True)
     count = np.bincount(cell)
 

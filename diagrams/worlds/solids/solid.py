@@ -1,5 +1,4 @@
-"""Solids: shapes of a material, drawn as Gaussians: flat patches on the faces of their surface,
-each with coordinates (u, v) in meters."""
+"""Solids: shapes of a material, drawn as flat Gaussians on the faces of their surface."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -94,23 +93,17 @@ class Solid:
 
     def albedo(self, uv: Array, p_W: Array) -> NDArray[np.floating]:
         """Returns colors (N, 3), sRGB, of points p_W (N, 3) [m] with face coordinates uv (N, 2)."""
-        return MATERIALS[self.material].albedo(uv, self._in_own_frame(p_W), self.seed)
-
-    def _in_own_frame(self, p_W: Array) -> Array:
-        """Converts points (N, 3) to the solid's frame, z along its axis, shifted by its seed."""
-        shape = self.shape
-        shift = 7.3 * np.array([self.seed % 61, self.seed % 53, 0.0])
-        match shape:
+        # In the solid's frame, z along its axis, shifted by its seed.
+        p, shift = p_W, 7.3 * np.array([self.seed % 61, self.seed % 53, 0.0])
+        match shape := self.shape:
             case shapes.Sphere():
-                return p_W - np.asarray(shape.p_WO) + shift
+                p = p_W - np.asarray(shape.p_WO) + shift
             case shapes.Box():
-                return shape.X_WO.inverse().multiply(p_W.T).T + shift
+                p = shape.X_WO.inverse().multiply(p_W.T).T + shift
             case shapes.Capsule() | shapes.Cylinder():
-                p_WA = np.asarray(shape.p_WA, dtype=float)
                 e_1, e_2, axis, _ = _axes(shape)
-                return (p_W - p_WA) @ np.column_stack([e_1, e_2, axis]) + shift
-            case shapes.HalfSpace():
-                return p_W
+                p = (p_W - np.asarray(shape.p_WA)) @ np.column_stack([e_1, e_2, axis]) + shift
+        return MATERIALS[self.material].albedo(uv, p, self.seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,7 +260,12 @@ def draw(spec: WorldSpec, solids: list[Solid], light: Illumination) -> GaussianS
     patches, albedos, opacities = zip(*drawn, strict=True)
     surfels = surfaces.Surfels.concatenate(list(patches))
     albedo, opacity = np.concatenate(albedos), np.concatenate(opacities)
-    seen = _is_seen(spec, surfels)
+    # Patches that face the volume and are in no other solid.
+    seen = spec.plan.is_faced(surfels.p, surfels.n)
+    all_shapes = [solid.shape for solid in spec.solids]
+    field = AnalyticDistanceField(all_shapes, spec.lower_W - 40.0, spec.upper_W + 40.0)
+    rows = np.flatnonzero(seen)
+    seen[rows] = field.distance(surfels.p[rows]) > -_BURIED
     surfels, albedo, opacity = surfels[seen], np.clip(albedo[seen], 0, 1), opacity[seen]
     irradiance = light.irradiance(surfels.p, surfels.n)
     colors = shade(albedo, irradiance, light.haze, spec.plan.outside(surfels.p))
@@ -283,7 +281,7 @@ def _patches(
     layers = []  # of patches, opacity, face and coordinates at which the pattern is sampled
     for face in cut_faces(solid.shape, spec.lower_W, spec.upper_W):
         if is_ground:
-            uv, extent = _ground(face, material.spacing, spec, rng)
+            uv, extent = _ground(material.spacing, spec, rng)
         else:
             uv, extent = (_spiral if face.round else _lattice)(face, material.spacing, rng)
         facing = spec.plan.is_faced(*face.at(uv)[:2])
@@ -295,14 +293,9 @@ def _patches(
             layer = surfaces.inset(layer, extent[:, 0], face.curved[0])
         # Means of the pattern at two points: thin lines tint all the patches they cross.
         layers.append((layer, 0.99, face, [uv + corner * extent for corner in _CORNERS]))
+        margin = surfaces.GROUND_REACH - 0.5 if is_ground else 0.0
         for marks in () if face.round else material.marks:
-            low, high = np.zeros(2), np.array(face.size)
-            if is_ground:
-                low, high = (
-                    np.full(2, surfaces.GROUND_REACH - 0.5),
-                    high - (surfaces.GROUND_REACH - 0.5),
-                )
-            uv, extent = _place_marks(marks, low, high, rng)
+            uv, extent = _place_marks(marks, face, margin, rng)
             p, n, t = face.at(uv)
             layers.append((surfaces.Surfels(p + _RAISED * n, n, t, extent), 0.93, face, [uv]))
     if not layers:
@@ -345,11 +338,11 @@ def _bulges(face: Face) -> bool:
 
 
 def _place_marks(
-    marks: Marks, low: Array, high: Array, rng: np.random.Generator
+    marks: Marks, face: Face, margin: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Returns coordinates uv (N, 2) [m] of the marks of a pattern between the corners `low` and
-    `high` (2,) of a face, and their standard deviations (N, 2) [m]."""
-    cell = np.array(marks.cell)
+    """Returns coordinates uv (N, 2) [m] of the marks of a pattern on a face without a margin [m],
+    and their standard deviations (N, 2) [m]."""
+    low, high, cell = np.full(2, margin), np.array(face.size) - margin, np.array(marks.cell)
     first, last = np.floor(low / cell).astype(int), np.ceil(high / cell).astype(int)
     i, j = (np.arange(a, b) for a, b in zip(first, last, strict=True))
     cells = np.stack(np.meshgrid(i, j, indexing="ij"), axis=-1).reshape(-1, 2) + marks.first
@@ -364,8 +357,7 @@ def _place_marks(
 
 
 def _spiral(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Returns coordinates (N, 2) and standard deviations (N, 2) that cover a round face evenly:
-    a spiral of golden angles with equal steps in area from the rim to the pole."""
+    """Covers a round face by a spiral of golden angles; see `_lattice`."""
     radius, (around, height) = face.curved[0], face.size
     flat = not _bulges(face)
     if not flat:
@@ -387,10 +379,8 @@ def _spiral(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array
     return np.column_stack([radius * angle, v]), extent
 
 
-def _ground(
-    face: Face, spacing: float, spec: WorldSpec, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Covers a horizontal plane, coarser outside the volume."""
+def _ground(spacing: float, spec: WorldSpec, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Covers a horizontal plane, coarser outside the volume; see `_lattice`."""
     corner = spec.lower_W[:2] - surfaces.GROUND_REACH
     uv, extent = [], []
     coarser = 1.0, 2.0, 4.0, 7.0, 12.0
@@ -399,16 +389,6 @@ def _ground(
         uv.append(p - corner)
         extent.append(surfaces.COVERAGE * times * spacing * rng.uniform(0.85, 1.2, (len(p), 2)))
     return np.concatenate(uv), np.concatenate(extent)
-
-
-def _is_seen(spec: WorldSpec, surfels: surfaces.Surfels) -> NDArray[np.bool_]:
-    """Marks patches that face the volume and are in no other solid."""
-    seen = spec.plan.is_faced(surfels.p, surfels.n)
-    shapes = [solid.shape for solid in spec.solids]
-    field = AnalyticDistanceField(shapes, spec.lower_W - 40.0, spec.upper_W + 40.0)
-    rows = np.flatnonzero(seen)
-    seen[rows] = field.distance(surfels.p[rows]) > -_BURIED
-    return seen
 
 
 def build(spec: WorldSpec) -> World:
