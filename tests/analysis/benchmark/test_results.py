@@ -23,7 +23,9 @@ def results(study, tmp_path, monkeypatch):
 def test_kept_results_agree_with_the_table_of_the_study(study, results, rows_of):
     kept = results.Results.read("small")
     assert kept.scenarios == ["short"] and len(kept.rows) == 2
-    for found, row in zip(results.success_rows(kept.rows), rows_of(study[1] / "table.csv"), strict=True):
+    for found, row in zip(
+        results.success_rows(kept.rows), rows_of(study[1] / "table.csv"), strict=True
+    ):
         for count in ("flights", "successes"):
             assert found[count] == int(row[count])
         assert found["clearance_m"] == pytest.approx(float(row["min_clearance_m"]), abs=1e-4)
