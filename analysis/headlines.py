@@ -10,6 +10,7 @@ import signal
 import sys
 import tempfile
 import time
+import timeit
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import asdict, dataclass, replace
@@ -85,23 +86,13 @@ class Effort:
 def milliseconds(call: Callable[[], object], repeats: int = 30) -> float:
     """Returns the minimum CPU time of the process [ms] over `repeats` calls, after a first one. CPU
     time does not count the waiting on a busy machine."""
-    durations = []
     call()
-    for _ in range(repeats):
-        start = time.process_time()
-        call()
-        durations.append(1e3 * (time.process_time() - start))
-    return min(durations)
+    return 1e3 * min(timeit.repeat(call, timer=time.process_time, repeat=repeats, number=1))
 
 
 def wall_seconds(call: Callable[[], object], repeats: int = 1) -> float:
     """Returns the minimum wall time [s] over `repeats` calls."""
-    durations = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        durations.append(time.perf_counter() - start)
-    return min(durations)
+    return min(timeit.repeat(call, repeat=repeats, number=1))
 
 
 def machine() -> str:
@@ -274,18 +265,17 @@ def _views(
 
 
 def scene_tensors(
-    scene: Any, view: tuple[np.ndarray, int, int], X_WCs: Sequence[Any]
+    scene: Any, view: tuple[np.ndarray, int, int], X_WCs: Sequence[Any], device: str = "cpu"
 ) -> dict[str, Any]:
     """Returns arguments of `rasterize`."""
     import torch
 
-    names = {name: name for name in ("means", "quats", "scales", "opacities")}
-    names["colors"] = "base_colors"
-    arrays = {key: getattr(scene, name) for key, name in names.items()}
+    K, width, height = view
+    arrays = {name: getattr(scene, name) for name in ("means", "quats", "scales", "opacities")}
+    arrays |= {"colors": scene.base_colors, "Ks": np.repeat(K[None], len(X_WCs), axis=0)}
     arrays["viewmats"] = np.stack([X_WC.inverse().GetAsMatrix4() for X_WC in X_WCs])
-    arrays["Ks"] = np.repeat(view[0][None], len(X_WCs), axis=0)
-    tensors = {key: torch.tensor(array, dtype=torch.float32) for key, array in arrays.items()}
-    return tensors | {"width": view[1], "height": view[2]}
+    tensors = {k: torch.tensor(v, dtype=torch.float32, device=device) for k, v in arrays.items()}
+    return tensors | {"width": width, "height": height}
 
 
 def flight(effort: Effort) -> Iterator[Headline]:
@@ -342,19 +332,24 @@ def training(effort: Effort) -> Iterator[Headline]:
         yield Headline(f"training of DiffAero in {name}", steps, "steps/s", required[name][1])
 
 
+def _forest_views(mode: str, width: int, height: int, count: int, device: str) -> dict[str, Any]:
+    """Returns arguments of `rasterize` of views of P02 on a device."""
+    scenario, world = _forest()
+    views = _views(scenario, world, width, height, count)
+    return scene_tensors(world.gaussians, *views, device) | {"render_mode": mode}
+
+
 def gpu_images(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     """Measures batches of images of P02 by gsplat, which has no median depth."""
     import torch
 
     from splatpilot.systems.splats import rasterize
 
-    scenario, world = _forest()
     kinds = {"depth 64x36": ("ED", 64, 36, 50_000), "RGB 160x120": ("RGB", 160, 120, 10_000)}
     counts = sorted({1, 16, 256, effort.vehicles})
     for name, (mode, width, height, required) in kinds.items():
         for count in counts:
-            given = scene_tensors(world.gaussians, *_views(scenario, world, width, height, count))
-            given = {k: _moved(v, device) for k, v in given.items()} | {"render_mode": mode}
+            given = _forest_views(mode, width, height, count, device)
 
             def render(given: Mapping[str, Any] = given) -> None:
                 rasterize(**given)[1][0, 0, 0].cpu()  # waits for the device
@@ -370,12 +365,10 @@ def gpu_agreement(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     """Compares an image of P02 by gsplat's kernels with ours."""
     from splatpilot.systems.splats import rasterize
 
-    scenario, world = _forest()
-    given: dict[str, Any] = scene_tensors(world.gaussians, *_views(scenario, world, 320, 240, 1))
-    given["render_mode"] = "RGB+ED"
-    ours = rasterize(**given)[0]
-    theirs = rasterize(**{k: _moved(v, device) for k, v in given.items()})[0]
-    error = (ours - theirs.cpu()).abs()
+    ours, theirs = (
+        rasterize(**_forest_views("RGB+ED", 320, 240, 1, each))[0].cpu() for each in ("cpu", device)
+    )
+    error = (ours - theirs).abs()
     yield Headline("GPU and CPU, median difference", float(error.median()), "", max=1e-5)
     share = 100 * float((error > 1e-3).float().mean())
     yield Headline("GPU and CPU, values that differ by 1e-3", share, "%", max=0.1)
@@ -424,10 +417,6 @@ def gpu_student(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     yield Headline(f"GPU, {effort.updates} updates of a student", rate, "samples/s")
 
 
-def _moved(value: Any, device: str) -> Any:
-    return value.to(device) if hasattr(value, "to") else value
-
-
 @contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
     """Raises TimeoutError in the block after some time; 0 for no limit."""
@@ -461,11 +450,8 @@ GPU_PARTS: dict[str, tuple[Part, float]] = {
 def run(
     parts: Mapping[str, tuple[Part, float]] | None = None, effort: Effort | None = None
 ) -> dict[str, Any]:
-    """Measures parts, by default all that this machine can, and prints a Markdown table.
-
-    Returns:
-        The machine, `rows`, the reasons of `failures` by part, and the printed `table`.
-    """
+    """Measures parts, by default all that this machine can, and prints a Markdown table. Returns
+    `machine`, `rows`, reasons of `failures` by part, and the printed `table`."""
     failures: dict[str, str] = {}
     if parts is None:
         parts = dict(CPU_PARTS)

@@ -53,8 +53,7 @@ def run(
     `rerun` is the file of a `RerunSink`."""
     folder = StudyFolder(study)
     spec, row, recorded = _read_flight(folder, id)
-    live = [each.label for each in folder.config().variants if each.policy == LIVE]
-    if spec.policy in live:
+    if (spec.policy, LIVE) in [each[:2] for each in folder.config().variants]:
         raise ValueError(
             f"{id} was flown by a system that a function of Python made; fly it again by the same "
             "call of study, in another folder"
@@ -62,8 +61,8 @@ def run(
     scenario = sample_scenario(next(kept_flights(folder, [spec]))[1])
     world = study_world(scenario)
     out = out or study / "replays" / id
-    filmed = meshcat or video
-    if filmed:
+    files = [name for name, asked in {"flight.html": meshcat, "flight.mp4": video}.items() if asked]
+    if filmed := bool(files):
         require_unused(out, overwrite)
         require_writable_folder(out)
     with contextlib.ExitStack() as stack:
@@ -73,15 +72,10 @@ def run(
         flight = fly_with_bar(diagram)
         if recording is not None:
             cast(RerunSink, diagram.GetSubsystemByName("rerun")).close()
-    recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video")) if filmed else None
-    if recorder is not None and meshcat:
-        shown = replayed_flight(id, flight, recorded_frames(recorder, scenario))
-        flight_page(scenario, world, [shown]).save(out / "flight.html")
-    if recorder is not None and video:
-        recorder.save(out / "flight.mp4", scenario.camera.z_far)
     common = min(len(flight.times), len(recorded["times"]))
-    states = flight.states[:common], recorded["states"][:common]
-    flown, before = (QuadrotorState.of(each).p_WB for each in states)
+    flown, before = (
+        QuadrotorState.of(states[:common]).p_WB for states in (flight.states, recorded["states"])
+    )
     deviation = float(np.linalg.norm(flown - before, axis=1).max())
     exact = digest(flight) == row["digest"]
     print(f"{id}: {flight.outcome} after {flight.times[-1]:.2f} s")
@@ -93,8 +87,13 @@ def run(
             f"{deviation:.3g} m. {_likely_reason(folder, spec, scenario)}."
         )
     if filmed:
-        files = {"flight.html": meshcat, "flight.mp4": video}
-        print(f"Wrote {' and '.join(name for name, write in files.items() if write)} in {out}")
+        recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video"))
+        if meshcat:
+            shown = replayed_flight(id, flight, recorded_frames(recorder, scenario))
+            flight_page(scenario, world, [shown]).save(out / "flight.html")
+        if video:
+            recorder.save(out / "flight.mp4", scenario.camera.z_far)
+        print(f"Wrote {' and '.join(files)} in {out}")
     return exact
 
 
@@ -112,11 +111,8 @@ def overlay(
                 f"{spec.id} flew another world than {first.id}; name flights of one scenario and "
                 "seed"
             )
-        times, states, clearances = (
-            arrays[name].astype(float) for name in ("times", "states", "clearances")
-        )
-        no_plans = np.empty((0, 0))
-        flights.append(ReplayedFlight(spec.id, row["outcome"], times, states, clearances, no_plans))
+        logs = (arrays[name].astype(float) for name in ("times", "states", "clearances"))
+        flights.append(ReplayedFlight(spec.id, row["outcome"], *logs, np.empty((0, 0))))
     scenario = sample_scenario(next(kept_flights(folder, [first]))[1])
     out = out or study / "replays" / first.id
     page = out / "flights.html"

@@ -45,10 +45,7 @@ INFEASIBLE = "infeasible"
 """The outcome of a flight that cannot start (`InfeasibleFlightError`), a failure with a reason. One
 that becomes infeasible in flight has `Outcome.ERROR`."""
 
-_END = "end_x_m", "end_y_m", "end_z_m"  # p_WB at the end
-
-_JERK_STRIDE = 5
-"""Samples between differentiated velocities: 0.1 s, beyond the controller's steps of 0.02 s."""
+_JERK_STRIDE = 5  # samples between differentiated velocities: beyond the controller's steps
 _MAX_WORLDS = 2  # in the cache of a process
 
 
@@ -76,13 +73,13 @@ def flight_metrics(flight: Flight, shortest: float) -> dict[str, float | str | b
     over the shortest one, minus one; NaN if it did not arrive. `jerk_m_s3` is the root mean square
     of the second differences of the velocity at 0.1 s, `smoothness` the logarithmic dimensionless
     jerk, -ln(T³ / v_max² ∫ |jerk|² dt) (N. Hogan and D. Sternad, J. Motor Behavior 41, 2009).
-    `end_x_m` to `end_z_m` are where it ended. `unobserved_fraction` is of `Flight.unobserved`.
     """
     summary = flight.summary()
     arrived = flight.outcome == Outcome.GOAL
     clearance = float(np.nanmin(flight.clearances))
     length = float(summary["path_length_m"])
     jerk, smoothness = jerk_metrics(QuadrotorState.of(flight.states).v_WB, flight.times)
+    end = QuadrotorState.of(flight.states[-1]).p_WB
     return {
         "success": arrived and clearance >= 0.0,
         "outcome": str(flight.outcome),
@@ -90,7 +87,7 @@ def flight_metrics(flight: Flight, shortest: float) -> dict[str, float | str | b
         "path_length_m": length,
         "mean_speed_m_s": float(summary["mean_speed_m_s"]),
         "min_clearance_m": clearance,
-        **dict(zip(_END, QuadrotorState.of(flight.states[-1]).p_WB.tolist(), strict=True)),
+        **{f"end_{axis}_m": x for axis, x in zip("xyz", end.tolist(), strict=True)},
         "shortest_path_m": shortest,
         "unobserved_fraction": flight.unobserved,
         "path_excess": length / shortest - 1.0 if arrived and shortest > 0 else math.nan,
@@ -109,9 +106,8 @@ def jerk_metrics(velocities: np.ndarray, times: np.ndarray) -> tuple[float, floa
     square = np.square(np.diff(sampled, n=2, axis=0) / step**2).sum(axis=1).mean()
     duration = step * (len(sampled) - 1)
     fastest = np.linalg.norm(sampled, axis=1).max()
-    if square == 0.0 or fastest == 0.0:
-        return float(np.sqrt(square)), math.nan
-    return float(np.sqrt(square)), float(-np.log(duration**4 * square / fastest**2))
+    smoothness = -np.log(duration**4 * square / fastest**2) if square and fastest else math.nan
+    return float(np.sqrt(square)), float(smoothness)
 
 
 def shortest_length(lengths: TimeOfArrival, p_WS: np.ndarray, goal_radius: float) -> float:
@@ -131,9 +127,9 @@ def fly_rollouts(
 ) -> list[Rollout | Fault]:
     """Flies flights, with their scenarios as YAML, up to the first fault.
 
-    Imports the plugins `modules`, and finds `policies`, MODULE:ATTRIBUTE, that none registers.
-
     Args:
+        modules: plugins to import.
+        policies: MODULE:ATTRIBUTE of policies that none of them registers.
         changed: scenarios by label, whose changed fields are columns of the rows.
         systems: functions by label of policies that make the policy's system.
     """
@@ -171,9 +167,8 @@ def _fly_rollout(
         ends = tuple(start_position(scenario, world)), tuple(goal_position(scenario, world))
         shortest = math.nan
         with contextlib.suppress(InfeasibleFlightError):  # for larger vehicles than this one
-            lengths = _lengths_to(world, ends[1])
             p_WS = QuadrotorState.of(flight.states[0]).p_WB
-            shortest = shortest_length(lengths, p_WS, scenario.goal_radius)
+            shortest = shortest_length(_lengths_to(world, ends[1]), p_WS, scenario.goal_radius)
         metrics = flight_metrics(flight, shortest) | {"digest": digest(flight)}
         metrics |= _difficulty(world, *ends, scenario.seed)
         if flight.reason:  # timing the policy could raise again
