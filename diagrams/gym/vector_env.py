@@ -221,17 +221,6 @@ class VectorFlightEnv(VectorEnv):
         infos = {name: np.where(mask, each[self._flight], 0) for name, each in drawn.items()}
         return infos | {f"_{name}": mask.copy() for name in infos}
 
-    def _move(self, rows: NDArray[np.intp], points: dict[str, list[float]]) -> None:
-        """Moves start or goal of flights."""
-        for row in rows:
-            flight = self._flight[row]
-            world = self.pool.worlds[self.pool.world[flight]]
-            scenario = replace(self.pool.scenarios[flight], **points)
-            scenario.validate()
-            arrays, state = self._arrays, sample_initial_state(scenario, world)
-            arrays.states[row], arrays.goals[row] = state, goal_position(scenario, world)
-            arrays.distances[row] = world.distance_field.distance(state[:3])
-
     def _seed(self, seed: int | Sequence[int | None] | None, mask: NDArray[np.bool_]) -> None:
         seeds: list[int | None] = [None] * self.num_envs
         if isinstance(seed, int | np.integer):
@@ -266,8 +255,13 @@ class VectorFlightEnv(VectorEnv):
         for name, values in pool.starts.items():
             getattr(arrays, name)[rows] = values[flights]
         self._previous[rows], self._count[rows] = 0.0, 0
-        if points:
-            self._move(rows, points)
+        for row, flight in zip(rows, flights, strict=True) if points else ():
+            world = pool.worlds[pool.world[flight]]
+            scenario = replace(pool.scenarios[flight], **points)
+            scenario.validate()
+            arrays.states[row] = sample_initial_state(scenario, world)
+            arrays.goals[row] = goal_position(scenario, world)
+            arrays.distances[row] = world.distance_field.distance(arrays.states[row, :3])
         arrays.ends[rows], self._ended[rows] = 0, False
         if pool.is_delayed:  # Until the first action has come, that of zeros counts.
             zeros = self._previous[rows]
@@ -334,7 +328,7 @@ class VectorFlightEnv(VectorEnv):
         ends[own] = _TERMINATED
         ended, terminated = ended | own, terminated | own
         self._previous[flying] = given[flying]
-        self._ended = ended
+        self._ended = ended.copy()
         if self.pool.is_delayed:
             np.copyto(self._decisions, decided, where=flying[:, None])
         self._count += flying
@@ -343,32 +337,20 @@ class VectorFlightEnv(VectorEnv):
             infos = {"outcome": _OUTCOMES[ends], "is_success": reached}
             infos |= {f"_{name}": ended.copy() for name in infos} | self._drawn(ended)
             if self._mode is AutoresetMode.SAME_STEP:
-                return self._reset_same_step(rewards, terminated, truncated, infos)
+                rows = np.flatnonzero(ended)
+                last, final = self._observe(rows), np.full(self.num_envs, None, dtype=object)
+                for k, row in enumerate(rows):
+                    is_dict = isinstance(last, dict)
+                    final[row] = {name: v[k] for name, v in last.items()} if is_dict else last[k]
+                self._begin(rows)
+                infos = {"final_obs": final, "final_info": infos}
+                infos |= {f"_{name}": ended.copy() for name in infos} | self._drawn(ended)
         if resting.any():
             infos |= self._drawn(resting | ended)
         observed = self._observe()
         if self._mode is AutoresetMode.DISABLED:
             self._last = deepcopy(observed)
         return observed, rewards, terminated, truncated, infos
-
-    def _reset_same_step(
-        self,
-        rewards: NDArray[np.float64],
-        terminated: NDArray[np.bool_],
-        truncated: NDArray[np.bool_],
-        infos: dict[str, Any],
-    ) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        ended = self._ended.copy()
-        rows = np.flatnonzero(ended)
-        last = self._observe(rows)
-        final = np.full(self.num_envs, None, dtype=object)
-        for k, row in enumerate(rows):
-            is_dict = isinstance(last, dict)
-            final[row] = {name: v[k] for name, v in last.items()} if is_dict else last[k]
-        self._begin(rows)
-        further = {"final_obs": final, "_final_obs": ended}
-        further |= {"final_info": infos, "_final_info": ended.copy()} | self._drawn(ended)
-        return self._observe(), rewards, terminated, truncated, further
 
     def _observe_again(self, rows: NDArray[np.intp]) -> Any:
         """Returns the observations of all environments, where `rows` have changed."""

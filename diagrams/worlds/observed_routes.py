@@ -28,11 +28,8 @@ _STARTS, _GOALS = 24, 6  # tried in a draw; goals for each start
 
 
 class ObservedViews:
-    """Measures the fraction of a view that shows no observed surface.
-
-    Such pixels show the frontier, nothing at all unless the capture saw the sky, or a surface that
-    no image saw from a similar direction. The last needs the world's `observations`.
-    """
+    """Measures the fraction of a view that shows the frontier, nothing unless the capture saw the
+    sky, or a surface that no image saw from a similar direction, by the world's `observations`."""
 
     def __init__(self, world: World, camera: OnboardCamera = _CAMERA) -> None:
         count = len(world.gaussians)
@@ -78,17 +75,12 @@ class ObservedViews:
         # The last pose keeps the heading of its approach.
         step = position(np.minimum(s + _STEP, at[-1])) - position(np.minimum(s, at[-1] - _STEP))
         yaws = np.arctan2(step[:, 1], step[:, 0])
-        return float(
-            np.mean([self.ahead(p, yaw) for p, yaw in zip(position(s), yaws, strict=True)])
-        )
+        return float(np.mean([*map(self.ahead, position(s), yaws)]))
 
 
 def with_views(world: World) -> World:
-    """Returns a world whose observations have a table of views in its flyable space.
-
-    Raises:
-        InfeasibleFlightError: if there is no such space.
-    """
+    """Returns a world whose observations have a table of views in its flyable space; raises
+    InfeasibleFlightError without such space."""
     if world.observations is None:
         return world
     points, spacing = longest_part(world.esdf, VEHICLE_RADIUS).p_WN, _MIN_SPACING
@@ -121,18 +113,20 @@ def choose_observed_route(
     min_length: float = SHORTEST,
     seed: int | None = None,
 ) -> ObservedRoute:
-    """Chooses a shortest route through known free space, at least `min_length` [m] long.
-
-    Along it the mean fraction of pixels without an observed surface is at most `limit`.
-
-    Given a seed, start and goal are drawn; otherwise the route is nearly the longest.
+    """Chooses a shortest route through known free space, at least `min_length` [m] long, with a
+    mean fraction of unobserved pixels up to `limit`; nearly the longest, or drawn from a seed.
 
     Raises:
         InfeasibleFlightError: if no such route is found.
     """
     search, longest = _search(world, limit, min_length)
     if longest is None:
-        raise search.infeasible(limit)
+        raise InfeasibleFlightError(
+            f"unobserved pixels along a route of at least {min_length:g} m in {world.name} "
+            f"must be at most {limit:.0%} of a camera's, on average, got no such route; the best "
+            f"single view has {search.table.min(initial=1.0):.0%}: capture more of the scene, or "
+            "raise max_unobserved"
+        )
     if seed is None:
         return longest
     return search.draw(limit, 0.6 * longest.length, np.random.default_rng(seed)) or longest
@@ -148,7 +142,7 @@ def choose_default_route(world: World) -> ObservedRoute:
     search = _Search(world, SHORTEST)
     observed = search.longest(MAX_UNOBSERVED)
     if observed is None or observed.length < LONG_ENOUGH:
-        return search.best() or observed or search.fallback()
+        return search.best(observed)
     return observed
 
 
@@ -165,19 +159,18 @@ class _Search:
     """Shortest routes of free space, and the fraction of unobserved pixels along them."""
 
     def __init__(self, world: World, min_length: float) -> None:
-        self._name, self._min_length = world.name, min_length
-        self._part = longest_part(world.esdf, VEHICLE_RADIUS, min_length=min_length)
+        self._min_length = min_length
+        self.part = longest_part(world.esdf, VEHICLE_RADIUS, min_length=min_length)
         observations = world.observations
         assert observations is not None and len(observations.view_points)
         self._views = ObservedViews(world)
-        self._p_WN = self._part.p_WN
-        clearance = world.esdf.distance(self._p_WN)
+        clearance = world.esdf.distance(self.part.p_WN)
         # Ends keep off surfaces, or a flight would end with a view of one.
-        typical = float(np.median(clearance[self._part.nodes]))
-        self._open = clearance >= min(CLEARANCE, typical)
-        self._table = observations.unobserved
+        typical = float(np.median(clearance[self.part.nodes]))
+        self.open = clearance >= min(CLEARANCE, typical)
+        self.table = observations.unobserved
         points = KDTree(observations.view_points)
-        self._row = np.asarray(points.query(self._p_WN)[1])  # of the table, for each node
+        self.row = np.asarray(points.query(self.part.p_WN)[1])  # of the table, for each node
 
     def longest(self, limit: float) -> ObservedRoute | None:
         """Returns nearly the longest route within the limit."""
@@ -187,11 +180,7 @@ class _Search:
             shortest = self._min_length if best is None else np.nextafter(best.length, np.inf)
             goals = np.flatnonzero((tree.goals >= shortest) & (tree.unobserved <= limit))
             goals = goals[np.argsort(-tree.lengths[goals], kind="stable")]
-            for goal in goals[:: max(len(goals) // _GOALS, 1)]:
-                route = self._route(tree, goal)
-                if route.unobserved <= limit:
-                    best = route
-                    break
+            best = self._first(tree, goals[:: max(len(goals) // _GOALS, 1)], limit) or best
         return best
 
     def draw(self, limit: float, desired: float, rng: np.random.Generator) -> ObservedRoute | None:
@@ -199,47 +188,40 @@ class _Search:
         for start in self._starts(limit, rng):
             tree = _Tree(self, start)
             longer = tree.goals >= max(desired, self._min_length)
-            for goal in rng.permutation(np.flatnonzero(longer & (tree.unobserved <= limit)))[
-                :_GOALS
-            ]:
-                route = self._route(tree, goal)
-                if route.unobserved <= limit:
-                    return route
+            goals = rng.permutation(np.flatnonzero(longer & (tree.unobserved <= limit)))
+            if route := self._first(tree, goals[:_GOALS], limit):
+                return route
         return None
 
-    def best(self) -> ObservedRoute | None:
+    def best(self, otherwise: ObservedRoute | None) -> ObservedRoute:
         """Returns a long route with nearly the smallest unobserved fraction."""
-        routes, enough = [], min(LONG_ENOUGH, 0.8 * self._part.length)
-        for start in np.random.default_rng(0).permutation(self._part.nodes)[: 4 * _STARTS]:
+        routes, enough = [], min(LONG_ENOUGH, 0.8 * self.part.length)
+        for start in np.random.default_rng(0).permutation(self.part.nodes)[: 4 * _STARTS]:
             tree = _Tree(self, int(start))
             fractions = np.where(tree.lengths >= enough, tree.unobserved, np.inf)
             if np.isfinite(fractions).any():
                 routes.append(self._route(tree, int(np.argmin(fractions))))
-        return min(routes, key=lambda route: route.unobserved, default=None)
-
-    def fallback(self) -> ObservedRoute:
-        tree = _Tree(self, self._part.end)
+        if best := min(routes, key=lambda route: route.unobserved, default=otherwise):
+            return best
+        tree = _Tree(self, self.part.end)
         return self._route(tree, int(np.argmax(tree.lengths)))
-
-    def infeasible(self, limit: float) -> InfeasibleFlightError:
-        return InfeasibleFlightError(
-            f"unobserved pixels along a route of at least {self._min_length:g} m in {self._name} "
-            f"must be at most {limit:.0%} of a camera's, on average, got no such route; the best "
-            f"single view has {self._table.min(initial=1.0):.0%}: capture more of the scene, or "
-            "raise max_unobserved"
-        )
 
     def _starts(self, limit: float, rng: np.random.Generator) -> NDArray[np.intp]:
         """Draws nodes of the part with an observed view."""
-        nodes = self._part.nodes[self._open[self._part.nodes]]
-        best = self._table[self._row[nodes]].min(axis=1)
+        nodes = self.part.nodes[self.open[self.part.nodes]]
+        best = self.table[self.row[nodes]].min(axis=1)
         return rng.permutation(nodes[best <= 2.0 * limit])[:_STARTS]
+
+    def _first(self, tree: "_Tree", goals: NDArray[np.intp], limit: float) -> ObservedRoute | None:
+        """Returns the first route to one of the goals that is within the limit."""
+        routes = (self._route(tree, goal) for goal in goals)
+        return next((route for route in routes if route.unobserved <= limit), None)
 
     def _route(self, tree: "_Tree", goal: int) -> ObservedRoute:
         nodes = [int(goal)]
         while nodes[-1] != tree.start:
             nodes.append(int(tree.before[nodes[-1]]))
-        points = self._p_WN[nodes[::-1]]
+        points = self.part.p_WN[nodes[::-1]]
         length = float(tree.lengths[goal])
         return ObservedRoute(points[0], points[-1], length, self._views.along(points))
 
@@ -249,7 +231,7 @@ class _Tree:
 
     def __init__(self, search: _Search, start: int) -> None:
         lengths, before = dijkstra(
-            search._part.graph,
+            search.part.graph,
             directed=False,
             indices=start,
             limit=_LONGEST,
@@ -258,12 +240,12 @@ class _Tree:
         self.start = start
         self.before = np.where(before < 0, start, before)  # of each node, towards the start
         self.lengths = np.where(np.isfinite(lengths), lengths, -1.0)  # [m]
-        self.goals = np.where(search._open, self.lengths, -1.0)  # [m]
-        step = search._p_WN - search._p_WN[self.before]
+        self.goals = np.where(search.open, self.lengths, -1.0)  # [m]
+        step = search.part.p_WN - search.part.p_WN[self.before]
         heading = np.arctan2(step[:, 1], step[:, 0]) * HEADINGS / (2.0 * np.pi)
-        rows, columns = search._row[self.before], np.round(heading).astype(int) % HEADINGS
+        rows, columns = search.row[self.before], np.round(heading).astype(int) % HEADINGS
         level = np.hypot(step[:, 0], step[:, 1]) > 1e-6
-        views = np.where(level, search._table[rows, columns], search._table[rows].min(axis=1))
+        views = np.where(level, search.table[rows, columns], search.table[rows].min(axis=1))
         # Sums along the tree, over twice as many steps in each pass.
         total = views * np.where(self.lengths > 0, self.lengths - self.lengths[self.before], 0.0)
         ancestor = self.before
