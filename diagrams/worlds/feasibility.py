@@ -45,11 +45,11 @@ def until_feasible[C: Config](
 
 
 def is_feasible(spec: WorldSpec) -> bool:
-    """Checks that start and goal are clear and that a path joins them. A coarse grid finds most
-    paths; the finest finds those through gaps of 1 m."""
+    """Checks that start and goal are clear and that a path joins them."""
     field, ends = spec.distance_field, (spec.p_WS, spec.p_WG)
     if not (conservative_distance(field, np.stack(ends)) >= CLEARANCE).all():
         return False
+    # A coarse grid finds most paths; the finest finds those through gaps of 1 m.
     return any(connects(field, *ends, VEHICLE_RADIUS, spacing) for spacing in (0.3, 0.15, 0.12))
 
 
@@ -124,8 +124,7 @@ def choose_start_and_goal(
     They are the ends of (nearly) the longest of all shortest paths, `min_length` to `longest` or
     1.5 `min_length` [m], of a sphere of `radius` through known free space, with `margin` [m] to
     spare or half of that. Given a seed, they are drawn: the start from the same part of free
-    space, the goal from the nodes whose shortest path is at least 60 % of that. After `_DRAWS`
-    starts without such a goal, the start is an end of the longest path.
+    space, the goal from the nodes whose shortest path is at least 60 % of that.
     """
     longest = max(longest, 1.5 * min_length)
     part = longest_part(esdf, radius, margin, longest, min_length)
@@ -133,10 +132,10 @@ def choose_start_and_goal(
         goal, length = _farthest(part.graph, part.end, longest)
         return part.p_WN[part.end], part.p_WN[goal], length
     rng = np.random.default_rng(seed)
+    desired = max(0.6 * min(part.length, longest), min_length)
     for attempt in range(_DRAWS + 1):
         start = int(rng.choice(part.nodes)) if attempt < _DRAWS else part.end
         lengths = dijkstra(part.graph, directed=False, indices=start, limit=longest)
-        desired = max(0.6 * min(part.length, longest), min_length)
         far = np.flatnonzero(np.isfinite(lengths) & (lengths >= desired))
         if len(far):
             goal = int(rng.choice(far))
@@ -236,8 +235,7 @@ def _infeasible(
 
 
 def grid_graph(free: NDArray[np.bool_], spacing: float) -> tuple[csr_array, NDArray[np.intp]]:
-    """Returns the graph that joins free nodes to their free neighbors, 26 at most, with weights
-    [m], and the flat index of each of its nodes."""
+    """Returns the graph [m] of free nodes and their 26 neighbors, and flat indices of the nodes."""
     nodes = np.flatnonzero(free)
     index = np.full(free.shape, -1)
     index.flat[nodes] = np.arange(len(nodes))
@@ -259,8 +257,7 @@ def grid_graph(free: NDArray[np.bool_], spacing: float) -> tuple[csr_array, NDAr
 
 
 def _farthest(graph: csr_array, node: int, longest: float = np.inf) -> tuple[int, float]:
-    """Returns the node with the longest shortest path from `node`, up to `longest` [m], and that
-    length [m]."""
+    """Returns the node with the longest shortest path [m] from `node`, and that length [m]."""
     lengths = dijkstra(graph, directed=False, indices=node, limit=longest)
     lengths[np.isinf(lengths)] = -1
     farthest = int(np.argmax(lengths))

@@ -24,8 +24,7 @@ def part_digests(parts: Iterable[bytes]) -> set[str]:
 
 
 def source_digest(digests: Collection[str]) -> list[str]:
-    """Returns the digest of a source: the eight smallest of its parts' digests, so that copies with
-    parts missing or added are recognized."""
+    """Returns the eight smallest digests of parts, so that copies are known by most parts."""
     return sorted(digests)[:8]
 
 
@@ -49,8 +48,8 @@ def check_split(split: str) -> None:
 
 
 def choose_split(what: str, digests: Collection[str], asked: str, found: str = "train") -> str:
-    """Returns the split of the source `what` with digests of parts: the one that the user `asked`
-    for, if any, or `found`; test sources are always of the test split."""
+    """Returns the split of a source: the one `asked` for or else `found`; that of test sources is
+    always test."""
     name = find_test_source(digests)
     if name is not None:
         found = "test"

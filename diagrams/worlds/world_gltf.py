@@ -54,8 +54,7 @@ class _Tile:
 
 def write_gltf(spec: WorldSpec, path: Path, texel: float = 0.02) -> None:
     """Writes the world of a spec as one self-contained .gltf file, y up. Light is baked into
-    emissive pictures with pixels of `texel` [m] on the solids: an engine shows the same colors
-    whatever lamps it has."""
+    emissive pictures with pixels of `texel` [m] on the solids."""
     light = spec.light(esdf_from_distance_field(spec.distance_field, spec.voxel_size))
     meshes = _solid_meshes(spec, light, texel)
     if surroundings := spec.surroundings():
@@ -117,16 +116,13 @@ def _solid_meshes(spec: WorldSpec, light: Illumination, texel: float) -> list[_M
     meshes = []
     for page, height in _pages(tiles):
         picture = np.zeros((height, _PAGE, 3), dtype=np.uint8)
-        vertices, uvs, triangles, count = [], [], [], 0
+        parts, count = [], 0
         for tile, (x, y) in page:
             picture[y : y + tile.pixels[1], x : x + tile.pixels[0]] = _paint(tile, spec, light)
             p, uv, corners = _triangulate(tile, x, y, height)
-            vertices.append(p)
-            uvs.append(uv)
-            triangles.append(corners + count)
+            parts.append((p, uv, corners + count))
             count += len(p)
-        p, uv, corners = map(np.concatenate, (vertices, uvs, triangles))
-        meshes.append(_Mesh(p, uv, corners, picture))
+        meshes.append(_Mesh(*map(np.concatenate, zip(*parts, strict=True)), picture))
     return meshes
 
 

@@ -1,7 +1,7 @@
 """Generated forests: layout, light and Gaussians."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -140,16 +140,10 @@ def _ferns(layout, light, p, rng) -> GaussianScene:
     along = np.broadcast_to(length[..., None] * 0.10, bend.shape)
     across = length[..., None] * 0.11 * (1.15 - s) * np.ones_like(bend)
     height = 0.02 + 0.025 * np.sin(np.pi * s) * np.ones_like(bend)
-    surfels = on_ground(
-        q.reshape(-1, 2),
-        bend.ravel(),
-        np.stack([along, across], axis=-1).reshape(-1, 2),
-        height.ravel(),
-    )
-    albedo = ramp(
-        [(0.20, 0.32, 0.10), (0.38, 0.50, 0.16), (0.52, 0.60, 0.22)],
-        0.5 + 0.35 * np.broadcast_to(s, bend.shape).ravel() - rng.uniform(0, 0.4, bend.size),
-    )
+    extent = np.stack([along, across], axis=-1).reshape(-1, 2)
+    surfels = on_ground(q.reshape(-1, 2), bend.ravel(), extent, height.ravel())
+    tone = 0.5 + 0.35 * np.broadcast_to(s, bend.shape).ravel() - rng.uniform(0, 0.4, bend.size)
+    albedo = ramp([(0.20, 0.32, 0.10), (0.38, 0.50, 0.16), (0.52, 0.60, 0.22)], tone)
     return _on_floor(layout, light, surfels, albedo, 0.92)
 
 
@@ -166,9 +160,9 @@ def rocks_and_logs(
         for log in layout.logs:
             side = tube(log[:3], log[3:6], log[6], (0.05, 0.11), rng)
             parts.append(inset(side, side.extent[:, 1], log[6]))
-            for p_E, inwards in ((log[:3], log[3:6] - log[:3]), (log[3:6], log[:3] - log[3:6])):
+            for p_E, p_F in ((log[:3], log[3:6]), (log[3:6], log[:3])):
                 cap = _sphere(p_E, log[6])
-                parts.append(cap[cap.n @ inwards < 0])
+                parts.append(cap[cap.n @ (p_F - p_E) < 0])
         surfels = Surfels.concatenate(parts)
         rotten = textures.bark(OAK, surfels.p) * (0.82, 0.68, 0.54)
         scenes.append(_grow_moss(light, surfels, rotten))
@@ -275,7 +269,6 @@ def paint_leaves(
 
 
 def _unit(v: NDArray) -> NDArray[np.float64]:
-    """Normalizes vectors (..., 3)."""
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
@@ -347,9 +340,13 @@ def _roughen(surfels: Surfels, marks: _Marks, rng: np.random.Generator) -> Surfe
     """Turns patches of a closed layer into marks of various sizes and directions."""
     N = len(surfels)
     extent = surfels.extent * marks.fill * rng.uniform(0.6, 1.25, (N, 2))
-    turn = rng.normal(0, marks.turn, N)[:, None]
-    t = np.cos(turn) * surfels.t + np.sin(turn) * np.cross(surfels.n, surfels.t)
-    return Surfels(surfels.p, surfels.n, t, extent)
+    t = _rotated(surfels.n, surfels.t, rng.normal(0, marks.turn, N)[:, None])
+    return replace(surfels, t=t, extent=extent)
+
+
+def _rotated(n: NDArray, t: NDArray, angle: NDArray) -> NDArray[np.float64]:
+    """Rotates vectors (N, 3) about unit normals (N, 3) by angles (N, 1) [rad]."""
+    return np.cos(angle) * t + np.sin(angle) * np.cross(n, t)
 
 
 def _bark(layout, light, species, layer, surfels, tree) -> NDArray:
@@ -368,9 +365,8 @@ def _bark(layout, light, species, layer, surfels, tree) -> NDArray:
     warm = textures.hash_unit(tree[:, None], seed=72)[:, None] - 0.5
     albedo = albedo * (0.78 + 0.42 * tone) * (1 + warm * np.array([0.12, 0.0, -0.14]))
     # Moss climbs the shady, damp side of the foot.
-    damp = surfels.n[:, :2] @ -light.daylight.direction[:2] + 0.9 * textures.fbm(
-        p_T * 2.2, 3, seed=73
-    )
+    shady = surfels.n[:, :2] @ -light.daylight.direction[:2]
+    damp = shady + 0.9 * textures.fbm(p_T * 2.2, 3, seed=73)
     moss = smoothstep(0.35, 0.85, damp + 0.55 - 0.45 * z) * (0.35 if species == BIRCH else 0.9)
     albedo = mix(albedo, textures.moss(p_T * 2.0), moss)
 
@@ -405,8 +401,7 @@ def crowns(layout: ForestLayout, light: Daylight, rng: np.random.Generator) -> G
             c *= (rng.uniform(0.3, 1, (clumps, 1)) ** 0.4) / np.linalg.norm(c, axis=1)[:, None]
             c = c * (1.25 * reach, 1.25 * reach, 0.42 * (high - low)) + (0, 0, (low + high) / 2)
             each = round(11 / coarse) + 2
-            d = rng.normal(size=(clumps, each, 3))
-            d /= np.linalg.norm(d, axis=-1, keepdims=True)
+            d = _unit(rng.normal(size=(clumps, each, 3)))
             q = (c[:, None] + d * rng.uniform(0.35, 0.75, (clumps, each, 1))).reshape(-1, 3)
             normal = d.reshape(-1, 3) + rng.normal(0, 0.5, q.shape)
             inner = 0.5 - 0.5 * d[..., 2].ravel()
@@ -417,10 +412,8 @@ def crowns(layout: ForestLayout, light: Daylight, rng: np.random.Generator) -> G
         values = q, normal, spread, np.full(len(q), kind), inner
         leaves.append([value[keep] for value in values])
     p, n, size, species, depth = map(np.concatenate, zip(*leaves, strict=True))
-    n /= np.linalg.norm(n, axis=1, keepdims=True)
-    t = perpendicular(n)
-    turn = rng.uniform(0, 2 * np.pi, (len(p), 1))
-    t = np.cos(turn) * t + np.sin(turn) * np.cross(n, t)
+    n = _unit(n)
+    t = _rotated(n, perpendicular(n), rng.uniform(0, 2 * np.pi, (len(p), 1)))
     albedo = np.empty((len(p), 3))
     for kind in (OAK, PINE, BIRCH):
         albedo[species == kind] = textures.leaf(kind, p[species == kind])

@@ -109,34 +109,23 @@ class ForestLayout(FloorPlan):
 
     def solids(self) -> tuple[list[Solid], list[Solid]]:
         """Returns the solids that can be nearest to a point of the volume, and the other solids.
-        The ground is never farther from such a point than the volume is high, so distances are
-        exact without solids farther from the volume than that."""
+        The ground is never farther from such a point than the volume is high."""
         ceiling, trees = self.upper[2], self.trees
         near = self.outside(trees.base) - trees.radius - ceiling * np.hypot(*trees.lean.T) < ceiling
         foot, top = trees.at(-BURIED), trees.at(ceiling + 2)
-        trunks = [
-            Solid(Capsule(p_A, p_B, float(r)), BARK[species], k)
-            for k, (p_A, p_B, r, species) in enumerate(
-                zip(foot, top, trees.radius, trees.species, strict=True)
-            )
-        ]
-        logs = (Capsule(log[:3], log[3:6], float(log[6])) for log in self.logs)
-        rocks = (Sphere(rock[:3], float(rock[3])) for rock in self.rocks)
-        solids = [
-            building_blocks.ground("forest_floor"),
-            *(trunk for trunk, is_near in zip(trunks, near, strict=True) if is_near),
-            *(Solid(log, "oak", k) for k, log in enumerate(logs)),
-            *(Solid(rock, "stone", k) for k, rock in enumerate(rocks)),
-        ]
-        tips = trees.base + 0.85 * trees.height[:, None] * trees.lean
-        upper = [
-            Solid(Capsule(p_A, np.array([*tip, 0.85 * h]), float(0.55 * r)), trunk.material, k)
-            for k, (p_A, tip, h, r, trunk) in enumerate(
-                zip(top, tips, trees.height, trees.radius, trunks, strict=True)
-            )
-            if 0.85 * h > ceiling + 2.5
-        ]
-        far = [trunk for trunk, is_near in zip(trunks, near, strict=True) if not is_near]
+        tips = np.column_stack([trees.base, 0.85 * trees.height])
+        tips[:, :2] += tips[:, 2:] * trees.lean
+        solids, far, upper = [building_blocks.ground("forest_floor")], [], []
+        for k, radius in enumerate(trees.radius):
+            material = BARK[trees.species[k]]
+            trunk = Solid(Capsule(foot[k], top[k], float(radius)), material, k)
+            (solids if near[k] else far).append(trunk)
+            if tips[k, 2] > ceiling + 2.5:
+                upper.append(Solid(Capsule(top[k], tips[k], float(0.55 * radius)), material, k))
+        for k, log in enumerate(self.logs):
+            solids.append(Solid(Capsule(log[:3], log[3:6], float(log[6])), "oak", k))
+        for k, rock in enumerate(self.rocks):
+            solids.append(Solid(Sphere(rock[:3], float(rock[3])), "stone", k))
         return solids, far + upper
 
 
@@ -189,7 +178,7 @@ def lay_out(config: TrunksConfig, rng: np.random.Generator, clear: ArrayLike) ->
 def _free_spot(
     rng: np.random.Generator, lower: NDArray, upper: NDArray, taken: NDArray, radius: float
 ) -> NDArray[np.float64] | None:
-    """Draws the center (2,) of a disc that overlaps no disc of `taken` (K, 3): x, y, radius."""
+    """Draws the center (2,) of a disc apart from discs `taken` (K, 3): x, y, radius."""
     draws = rng.uniform(lower[:2], upper[:2], (100, 2))
     gap = np.linalg.norm(draws[:, None] - taken[:, :2], axis=-1) - taken[:, 2] - radius
     free = (gap > 0.15).all(axis=1)

@@ -1,7 +1,4 @@
-"""Procedural textures, colors as pure functions of position, and their illumination.
-
-Colors are sRGB in 0 to 1. Positions are in meters; scale them before the call to stretch a pattern.
-"""
+"""Procedural textures, sRGB in 0 to 1 as functions of position [m], and their illumination."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -17,8 +14,7 @@ _PRIMES = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], dtype=np.uint32)
 
 
 def hash_unit(cell: ArrayLike, seed: int = 0) -> Array:
-    """Returns a pseudo-random number in [0, 1) for every lattice cell (..., d), d = 1 to 3, by the
-    `lowbias32` hash."""
+    """Returns `lowbias32` hashes (...,) in [0, 1) of lattice cells (..., d), d = 1 to 3."""
     cell = np.asarray(cell).astype(np.int64).astype(np.uint32)  # wraps negative cells
     h = np.full(cell.shape[:-1], _seeded(seed), dtype=np.uint32)
     for axis in range(cell.shape[-1]):
@@ -41,8 +37,8 @@ def _mix_bits(h: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def value_noise(p: ArrayLike, seed: int = 0) -> Array:
-    """Computes smooth noise in [-1, 1] with a period of about two units at (..., d), d = 1 to 3.
-    Random values on the integer lattice are blended with 6 t^5 - 15 t^4 + 10 t^3."""
+    """Computes noise (...,) in [-1, 1] at (..., d), d = 1 to 3: random values on the integer
+    lattice, blended by 6 t^5 - 15 t^4 + 10 t^3."""
     p = np.asarray(p, dtype=np.float64)
     # Weight and hash of each corner of a cell, axis by axis.
     corners = [(np.float32(1.0), np.uint32(_seeded(seed)))]
@@ -205,8 +201,8 @@ class Daylight:
     def irradiance(
         self, normal: ArrayLike, sunlit: ArrayLike, leafy: bool = False
     ) -> NDArray[np.float64]:
-        """Computes light, linear (N, 3), on surfaces of unit normals (N, 3) in the fraction
-        `sunlit` (N,) of the sun; leaves (`leafy`) let light through."""
+        """Computes linear light (N, 3) on unit normals (N, 3) in the fraction `sunlit` (N,) of the
+        sun; leaves (`leafy`) let it through."""
         normal = np.asarray(normal)
         facing = normal @ self.direction
         facing = 0.35 + 0.65 * np.abs(facing) if leafy else np.clip(facing, 0, None)
@@ -250,8 +246,7 @@ class Daylight:
 def shade(
     albedo: NDArray, irradiance: ArrayLike, haze: ArrayLike, distance: ArrayLike
 ) -> NDArray[np.float64]:
-    """Computes colors (N, 3), sRGB, of surfaces of an albedo (N, 3), sRGB, in linear light (N, 3)
-    and haze (3,), sRGB, at distances (N,) [m]."""
+    """Computes sRGB (N, 3) of an sRGB albedo (N, 3) in linear light (N, 3), see `fade`."""
     return fade(develop(albedo**GAMMA * np.asarray(irradiance)), haze, distance)
 
 
@@ -337,8 +332,8 @@ class Lamplight:
 
 
 def openness(esdf: Esdf, p_W: Array, n_W: Array) -> Array:
-    """Computes the fraction (N,) of the sky seen from p_W (N, 3) [m]: less in corners, where the
-    distance grows slowly along the normal n_W (N, 3)."""
+    """Computes the fraction (N,) of the sky seen from p_W (N, 3) [m] with normals n_W (N, 3): less
+    in corners, where the distance grows slowly."""
     visible = np.zeros(len(p_W))
     for step in (0.25, 0.7):
         distance = esdf.distance(p_W + step * n_W)
