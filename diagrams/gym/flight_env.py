@@ -101,9 +101,7 @@ class FlightEnv(gymnasium.Env):
         modes = self.metadata["render_modes"]
         known = f"one of {', '.join(modes)}, or None"
         require(render_mode in (None, *modes), "render_mode", known, repr(render_mode))
-        valid = world is None or fields.get("num_worlds", 1) == 1
-        require(valid, "num_worlds", "1 with a world", fields.get("num_worlds"))
-        self.config = env_config(scenario, **fields)
+        self.config = env_config(scenario, world, **fields)
         self.render_mode, self._world = render_mode, world
         self.metadata = self.metadata | {"render_fps": self.config.rate}
         self.time_step = 1.0 / self.config.rate
@@ -113,7 +111,7 @@ class FlightEnv(gymnasium.Env):
         self.meshcat: Meshcat | None = None
         self._ended = True
         world = self._find_world(self.config.scenario)
-        self._take(self._find_flight(self.config.scenario, world))
+        self._take_flight(self.config.scenario, world)
         ports = self.parts.measured
         names = self.config.observation_names()
         self._spaces = {n: _port_space(ports[n]) for n in names if n in ports}
@@ -146,20 +144,15 @@ class FlightEnv(gymnasium.Env):
             simulator.set_target_realtime_rate(1.0)
         return _BuiltFlight(parts, simulator)
 
-    def _find_flight(self, scenario: Scenario, world: World) -> "_BuiltFlight":
-        """Returns the flight of a world, or a new one if noise differs from flight to flight."""
-        if not only_start_is_random(self.config.scenario):
-            return self._build(scenario, world)
-        if id(world) not in self._flights:
-            flight = self._flights[id(world)] = self._build(scenario, world)
+    def _take_flight(self, scenario: Scenario, world: World) -> None:
+        """Takes the flight of a world, or a new one if noise differs from flight to flight."""
+        flight = self._flights.get(id(world)) or self._build(scenario, world)
+        if only_start_is_random(self.config.scenario) and id(world) not in self._flights:
+            self._flights[id(world)] = flight
             is_native = self._native and self.render_mode != "human"
             if is_native and can_fly_natively(self.config, world):
                 context = flight.simulator.get_mutable_context()
                 flight.native = NativeFlight(self.config, flight.parts, context)
-        return self._flights[id(world)]
-
-    def _take(self, flight: "_BuiltFlight") -> None:
-        """Makes a flight the present one."""
         self._flight, self.parts, self.simulator = flight, flight.parts, flight.simulator
         self.diagram = cast(Diagram, self.simulator.get_system())
         self._action = self.diagram.GetInputPort(self.config.action)
@@ -188,14 +181,13 @@ class FlightEnv(gymnasium.Env):
         scenario = replace(base, seed=int(draw(MAX_SEED)), **points)
         if points:
             scenario.validate()
-        self._take(self._find_flight(scenario, world))
+        self._take_flight(scenario, world)
         if only_start_is_random(base):
             self._restart(scenario)
         else:
             context = self.simulator.get_mutable_context()
             self.diagram.SetRandomContext(context, RandomGenerator(scenario.seed))
-        flight = self._flight
-        self._vehicles = flight.native.vehicles() if flight.native else flight.vehicles()
+        self._vehicles = self._flight.vehicles()
         self._previous = np.zeros((1, *cast(Box, self.action_space).shape))
         hover = decisions(self.config, self._previous, self._vehicles.states)
         self._action.FixValue(self.simulator.get_mutable_context(), hover[0])
@@ -230,13 +222,12 @@ class FlightEnv(gymnasium.Env):
         periods = round(self.time_step / period)
         if flight.native:
             outcome = flight.native.step(decision, periods)
-            self._vehicles = flight.native.vehicles()
         else:
             # The time of the controller's update as Drake computes it, which saves a tiny step.
             end = self._steps * periods * period
             self.simulator.AdvanceTo(min(end, scenario.timeout))
             outcome = flight.parts.monitor.outcome(flight.monitor_context)
-            self._vehicles = flight.vehicles()
+        self._vehicles = flight.vehicles()
         transition = Transition(
             states=before.states,
             next_states=self._vehicles.states,
@@ -312,6 +303,8 @@ class _BuiltFlight:
 
     def vehicles(self) -> Vehicles:
         """Returns the vehicle, with its true state."""
+        if self.native:
+            return self.native.vehicles()
         names = "true_state", "goal", "distance", "gradient"
         state, goal, distance, gradient = map(self.eval, names)
         return Vehicles(state[None], goal[None], distance, gradient[None])

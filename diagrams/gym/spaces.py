@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from splatpilot.diagrams.flight.blocks import DECISIONS
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import scenario_file
+from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import soft_barrier
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.distributions import is_distribution
@@ -148,7 +149,8 @@ def observation_space(
 
 def _space(name: str, camera: OnboardCamera) -> Box:
     if name in _BOUNDS:
-        return Box(*(bound.astype(np.float32) for bound in _BOUNDS[name]), dtype=np.float32)
+        low, high = (bound.astype(np.float32) for bound in _BOUNDS[name])
+        return Box(low, high, dtype=np.float32)
     size = camera.height, camera.width
     if name == "depth_m":
         return Box(0.0, camera.max_depth, size, np.float32)
@@ -374,8 +376,12 @@ def find_scenario(scenario: Scenario | str | Path) -> Scenario:
     return load_config(Scenario(), scenario_file(str(scenario)))
 
 
-def env_config(scenario: Scenario | str | Path, **arguments: Any) -> FlightEnvConfig:
+def env_config(
+    scenario: Scenario | str | Path, world: World | None = None, **arguments: Any
+) -> FlightEnvConfig:
     """Returns the valid configuration of an environment of a scenario, see `find_scenario`."""
+    num_worlds = arguments.get("num_worlds", 1)
+    require(world is None or num_worlds == 1, "num_worlds", "1 with a world", num_worlds)
     known = [each.name for each in fields(FlightEnvConfig)[1:]]
     for name in set(arguments) - set(known):
         raise ValueError(unknown("argument", name, known))

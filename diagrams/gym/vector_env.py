@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from gymnasium.error import ResetNeeded
-from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
@@ -112,10 +112,8 @@ class VectorFlightEnv(VectorEnv):
         require(render_mode in (None, "rgb_array"), "render_mode", known, repr(render_mode))
         scenarios = [scenario] if isinstance(scenario, Scenario | str | Path) else list(scenario)
         require(scenarios, "scenario", "one or several scenarios", scenarios)
-        valid = world is None or fields.get("num_worlds", 1) == 1
-        require(valid, "num_worlds", "1 with a world", fields.get("num_worlds"))
         require(world is None or pool is None, "world", "left out with a pool", world)
-        configs = [env_config(each, **fields) for each in scenarios]
+        configs = [env_config(each, world, **fields) for each in scenarios]
         self.num_envs, self.render_mode, self.config = num_envs, render_mode, configs[0]
         self._mode = AutoresetMode(autoreset_mode)
         self.metadata = {
@@ -130,28 +128,19 @@ class VectorFlightEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.time_step = 1.0 / self.config.rate
-        periods = {each.scenario.controller.period for each in configs}
-        steps = {each.scenario.simulator.max_step_size for each in configs}
-        gravities = {config.gravity for config in configs}
-        alike = {"controller.period": periods, "simulator.max_step_size": steps}
-        for name, values in (alike | {"vehicle.gravity": gravities}).items():
+        for name in ("scenario.controller.period", "scenario.simulator.max_step_size", "gravity"):
+            values = {attrgetter(name)(config) for config in configs}
             require(len(values) == 1, name, "the same in all scenarios", sorted(values))
-        (period,) = periods
-        self._steps = {"periods": round(self.time_step / period)}
-        self._steps |= integration_steps(self.config.scenario)
+        self._steps = integration_steps(self.config.scenario)
+        self._steps["periods"] = round(self.time_step / self.config.scenario.controller.period)
         threads = threads or available_cores()
         self._threads, self._renderer = _native.FlightThreads(threads), BatchRenderer(threads)
         self.pool = pool or WorldPool(configs, world)
-        same = self.pool.matches(configs)
+        same = self.pool.sources == [(config.scenario, config.num_worlds) for config in configs]
         require(same, "pool", "that of the same scenarios and num_worlds", "another")
-        self._allocate()
-
-    def _allocate(self) -> None:
-        """Allocates the arrays of the N vehicles, which native code updates."""
-        n, size = self.num_envs, cast(Box, self.single_action_space).shape[0]
+        n, size = num_envs, self.single_action_space.shape[0]
         self._flight = np.zeros(n, int)  # index in the pool
         self._arrays = VehicleArrays(n, self.pool.radius)
-        self._gradients = np.zeros((n, 3))
         self._delays, self._decisions = np.zeros(n, np.int32), np.zeros((n, size))
         self._previous, self._count = np.zeros((n, size)), np.zeros(n, np.int64)
         self._seeds, self._episodes = np.zeros(n, np.uint64), np.zeros(n, np.uint64)
@@ -257,7 +246,7 @@ class VectorFlightEnv(VectorEnv):
         self._previous[rows], self._count[rows] = 0.0, 0
         for row, flight in zip(rows, flights, strict=True) if points else ():
             world = pool.worlds[pool.world[flight]]
-            scenario = replace(pool.scenarios[flight], **points)
+            scenario = replace(pool.scenarios[flight], **(points or {}))
             scenario.validate()
             arrays.states[row] = sample_initial_state(scenario, world)
             arrays.goals[row] = goal_position(scenario, world)
@@ -368,7 +357,7 @@ class VectorFlightEnv(VectorEnv):
         """Returns the observations of environments, in new arrays."""
         names, arrays = self.config.observation_names(), self._arrays
         states, p_WG = (np.array(each[rows], order="F") for each in (arrays.states, arrays.goals))
-        vehicles = Vehicles(states, p_WG, arrays.distances[rows], self._gradients[rows])
+        vehicles = Vehicles(states, p_WG, arrays.distances[rows], np.zeros_like(p_WG))
         if "obstacle" in names:
             distances, gradients = query(self.pool.native, states, arrays.world[rows])
             vehicles = vehicles._replace(distances=distances, gradients=gradients)

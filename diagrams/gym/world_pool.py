@@ -61,7 +61,7 @@ class WorldPool:
         self.scenarios: list[Scenario] = []  # (F,), of the flights
         self._made: World | None = None  # the last one
         self._fields: dict[int, int] = {}  # native numbers by the identity of distance fields
-        self._configs = list(configs)
+        self.sources = [(config.scenario, config.num_worlds) for config in configs]
         worlds, world_seeds, states, numbers = [], [], [], []
         turns = [(i, k) for i, config in enumerate(configs) for k in range(config.num_worlds)]
         for number, k in Progress(turns, "making worlds", unit="world", delay=1.0):
@@ -119,13 +119,6 @@ class WorldPool:
 
     def __len__(self) -> int:
         return len(self.scenarios)
-
-    def matches(self, configs: Sequence[FlightEnvConfig]) -> bool:
-        """Checks if the pool has the flights of these configurations."""
-        given, made = (
-            [(c.scenario, c.num_worlds) for c in each] for each in (configs, self._configs)
-        )
-        return given == made
 
     def _add(self, world: World) -> World:
         """Adds the distance field of a world to the native ones; returns the world, with the arrays
