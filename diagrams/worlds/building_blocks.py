@@ -1,6 +1,6 @@
 """Building blocks of procedural worlds: volumes, boxes, halls, signs, daylight, lamps."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +59,7 @@ def hall(plan: FloorPlan, materials: list[str], rng: np.random.Generator) -> lis
     return [box(low, high, *draw_paint(materials, rng)) for low, high in sides]
 
 
-def draw_paint(materials: Sequence[str], rng: np.random.Generator) -> tuple[str, int]:
+def draw_paint(materials: list[str], rng: np.random.Generator) -> tuple[str, int]:
     """Draws material and seed of a solid."""
     return materials[rng.integers(len(materials))], int(rng.integers(1000))
 

@@ -248,7 +248,7 @@ class MeshScene(BakedScene):
             points[np.isnan(points[..., 0])] = -1e6  # outside, where remap fills with 0
             u, v = np.ascontiguousarray(np.moveaxis(points, -1, 0))
             color = np.asarray(cv2.remap(color, u, v, cv2.INTER_LINEAR))
-            depth = np.asarray(cv2.remap(depth, u, v, cv2.INTER_NEAREST))
+            depth = np.asarray(cv2.remap(depth, u, v, cv2.INTER_NEAREST), np.float32)
         view = RenderedView((color / 255).astype(np.float32), depth, (depth > 0).astype(np.float32))
         if len(moving.means):
             bodies = empty_scene().render(*camera, moving=moving, distortion=distortion)

@@ -122,7 +122,8 @@ def _solid_meshes(spec: WorldSpec, light: Illumination, texel: float) -> list[_M
             p, uv, corners = _triangulate(tile, x, y, height)
             parts.append((p, uv, corners + count))
             count += len(p)
-        meshes.append(_Mesh(*map(np.concatenate, zip(*parts, strict=True)), picture))
+        p, uv, corners = map(np.concatenate, zip(*parts, strict=True))
+        meshes.append(_Mesh(p, uv, corners, picture))
     return meshes
 
 
