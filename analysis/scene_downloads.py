@@ -19,27 +19,18 @@ from urllib.parse import quote
 import numpy as np
 
 from splatpilot.analysis.environments import INDEX, Record, read_index
-from splatpilot.diagrams.worlds.scene_folder import (
-    ENVIRONMENT,
-    ESDF,
-    FRONTIER,
-    OBSERVATIONS,
-    PACKED_GAUSSIANS,
-    read_gaussians,
-    read_scene_metadata,
-    write_scene_metadata,
-)
+from splatpilot.diagrams.worlds import scene_folder
+from splatpilot.diagrams.worlds.scene_folder import ESDF, PACKED_GAUSSIANS, read_scene_metadata
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.common.files import folder_written_atomically, written_atomically
+from splatpilot.systems.common.files import folder_written_atomically, write_text
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.readers import read_text
 from splatpilot.systems.common.validation import require, unknown
 from splatpilot.systems.splats.splat_files import write_splats
 
 LIST = "scenes.json"
-_SCENE = "scene.yaml"
-_COPIED = FRONTIER, ENVIRONMENT, OBSERVATIONS
-_FILES = {_SCENE, PACKED_GAUSSIANS, ESDF, *_COPIED}
+_COPIED = scene_folder.FRONTIER, scene_folder.ENVIRONMENT, scene_folder.OBSERVATIONS
+_FILES = {"scene.yaml", PACKED_GAUSSIANS, ESDF, *_COPIED}
 _STEPS = 1024.0  # per meter; distances are rounded down to them, which halves their file
 _TIMEOUT = 30.0  # [s] without an answer
 _MAX_LIST = 1 << 24  # [bytes]
@@ -81,13 +72,12 @@ def pack(*, names: Sequence[str], scenes: Path, out: Path) -> dict[str, PackedSc
         with folder_written_atomically(out / name, replace=True) as folder:
             _pack(scenes / name, folder, record)
             files = {
-                file.name: PackedFile(file.stat().st_size, sha256(file.read_bytes()).hexdigest())
+                file.name: PackedFile(file.stat().st_size, _digest(file.read_bytes()))
                 for file in sorted(folder.iterdir())
             }
         listed[name] = PackedScene(record.license, files)
-        with written_atomically(out / LIST) as partial:
-            content = {each: asdict(scene) for each, scene in sorted(listed.items())}
-            partial.write_text(json.dumps(content, indent=1))
+        content = {each: asdict(scene) for each, scene in sorted(listed.items())}
+        write_text(file, json.dumps(content, indent=1))
     return {name: listed[name] for name in names}
 
 
@@ -96,8 +86,8 @@ def _pack(scene: Path, folder: Path, record: Record) -> None:
     # The capture stays where it is.
     made_of = metadata.provenance.replace(metadata.capture or record.source, record.source)
     made_of += f"; license {record.license}"
-    write_scene_metadata(folder, replace(metadata, capture="", provenance=made_of))
-    write_splats(read_gaussians(scene), folder / PACKED_GAUSSIANS)
+    scene_folder.write_scene_metadata(folder, replace(metadata, capture="", provenance=made_of))
+    write_splats(scene_folder.read_gaussians(scene), folder / PACKED_GAUSSIANS)
     esdf = Esdf.load(scene / ESDF)
     replace(esdf, distances=np.floor(esdf.distances * _STEPS) / _STEPS).save(folder / ESDF)
     for name in _COPIED:
@@ -117,7 +107,7 @@ def get(*, names: Sequence[str], source: str, scenes: Path) -> dict[str, PackedS
         packed, target = listed[name], scenes / name
         if target.exists():
             kept = {file: target / file for file in packed.files if (target / file).is_file()}
-            digests = {name: sha256(file.read_bytes()).hexdigest() for name, file in kept.items()}
+            digests = {name: _digest(file.read_bytes()) for name, file in kept.items()}
             same = digests == {file: about.sha256 for file, about in packed.files.items()}
             remedy = "choose another --out, or remove it"
             require(same, str(target), f"the scene of {source}", "another one", remedy)
@@ -127,12 +117,16 @@ def get(*, names: Sequence[str], source: str, scenes: Path) -> dict[str, PackedS
             for file, about in Progress(packed.files.items(), f"getting {name}", unit="file"):
                 url = f"{base}/{quote(name)}/{file}"
                 content = _fetch(url, about.bytes)
-                digest, remedy = sha256(content).hexdigest(), "get it again"
+                digest, remedy = _digest(content), "get it again"
                 require(digest == about.sha256, f"digest of {url}", about.sha256, digest, remedy)
                 (folder / file).write_bytes(content)
             read_scene_metadata(folder)
         print(f"Wrote {target}; license: {packed.license}")
     return {name: listed[name] for name in names}
+
+
+def _digest(content: bytes) -> str:
+    return sha256(content).hexdigest()
 
 
 def _parse_list(content: bytes, where: str) -> dict[str, PackedScene]:

@@ -66,10 +66,8 @@ def write_report(
     absent: dict[str, str],
     damaged: list[str],
 ) -> None:
-    """Writes `report.html`, `success_against_speed.png` and `trajectories.png`.
-
-    `absent` has the reasons of scenarios that were not flown, `damaged` the errors of files that
-    were flown again.
+    """Writes `report.html`, `success_against_speed.png` and `trajectories.png`; `absent` has the
+    reasons of scenarios that were not flown, `damaged` the errors of files that were flown again.
     """
     paper = paper_rows(config, absent)
     seeds = SPLIT_NAMES[config.split] + " seeds"
@@ -278,9 +276,10 @@ def _scenarios(
 
 
 def _flights(config: StudyConfig, rows: list[Row]) -> str:
-    own = {each.label: each.policy.partition(":") for each in config.variants}
     imports = {
-        label: f"--import {module} " if colon else "" for label, (module, colon, _) in own.items()
+        each.label: f"--import {each.policy.partition(':')[0]} "
+        for each in config.variants
+        if ":" in each.policy
     }
     header = ["flight", "outcome", "time [s]", "min. clearance [m]", "velocity [m/s]", "replay"]
     columns = {"flight_time_s": ".1f", "min_clearance_m": "+.2f", "mean_speed_m_s": ".2f"}

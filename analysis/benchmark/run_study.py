@@ -1,6 +1,5 @@
 """`study` and `splatpilot benchmark`: fly, resume or extend a study, and write its report."""
 
-import contextlib
 import functools
 import tempfile
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
@@ -262,19 +261,13 @@ def study(
         flown = (policy_speed(each.policy) for each in given.values())
         own += [speed for speed in flown if isinstance(speed, float | int)]
     if speeds is None:
-        known = sorted(set(own)) or [DEFAULT_SPEED]
-        listed = ", ".join(f"{speed:g}" for speed in known)
-        require(
-            len(known) == 1, "speeds of the policies", "equal", listed, f"give speeds=[{listed}]"
-        )
-        speeds = known
+        speeds = sorted(set(own)) or [DEFAULT_SPEED]
+        what, listed = "speeds of the policies", ", ".join(f"{speed:g}" for speed in speeds)
+        require(len(speeds) == 1, what, "equal", listed, f"give speeds=[{listed}]")
     elif SCENARIO in texts and len(speeds) == 1:
-        given = {
-            name: replace(each, policy=at_speed(each.policy, speeds[0]))
-            if policy_speed(each.policy) is not None
-            else each
-            for name, each in given.items()
-        }
+        for name, each in given.items():
+            if policy_speed(each.policy) is not None:
+                given[name] = replace(each, policy=at_speed(each.policy, speeds[0]))
     config = StudyConfig(
         scenarios=scenario_texts(names, parameter_rows(parameters, samples)),
         policies=texts,
@@ -282,17 +275,9 @@ def study(
         seeds=seeds,
         split=split,
     )
-    with contextlib.ExitStack() as stack:
-        folder = out or stack.enter_context(tempfile.TemporaryDirectory())
-        flown = run(
-            config=config,
-            out=Path(folder),
-            jobs=jobs,
-            cluster=cluster,
-            given=given,
-            systems=systems,
-            report=out is not None,
-        )
+    with tempfile.TemporaryDirectory() as folder:
+        options: dict[str, Any] = {"jobs": jobs, "cluster": cluster, "report": out is not None}
+        flown = run(config=config, out=Path(out or folder), given=given, systems=systems, **options)
     return pd.DataFrame(flown.rows)
 
 

@@ -22,12 +22,7 @@ from splatpilot.analysis.benchmark.variants import (
     parse_scenario,
     parse_variant,
 )
-from splatpilot.diagrams.flight.policies import (
-    MAX_SPEED,
-    POLICIES,
-    policy_name,
-    policy_speed,
-)
+from splatpilot.diagrams.flight.policies import MAX_SPEED, POLICIES, policy_name, policy_speed
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.world import World
@@ -107,25 +102,23 @@ class StudyConfig:
         ]
 
     def load_scenarios(self, given: Mapping[str, Scenario] | None = None) -> dict[str, Scenario]:
-        """Loads the scenarios, by label, with the overrides, and checks that the study can fly.
-
-        Args:
-            given: scenarios by name; others are found by `scenario_file`.
-        """
+        """Loads the scenarios, by label, with the overrides, and checks that the study can fly;
+        `given` are scenarios by name, others are found by `scenario_file`."""
         self.validate()
-        for override in self.overrides:
-            _check_override(override, "")
+        _check_overrides(self.overrides, "")
         scenarios = {}
         for variant in self.scenario_variants:
-            for override in variant.overrides:
-                _check_override(override, f" by scenario {variant.label}")
+            _check_overrides(variant.overrides, f" by scenario {variant.label}")
             overrides = [*self.overrides, *variant.overrides]
             if given and variant.scenario in given:
                 scenario = load_config(given[variant.scenario], overrides=overrides)
             else:
                 file = scenario_file(variant.scenario)
                 scenario = load_config(Scenario(), file, overrides)
-                self._check_own_policy(file)
+                if self.flies_own_policies and not _has_own_policy(file):
+                    raise ValueError(
+                        f"{file} has no `policy`, which --policies {SCENARIO} would fly"
+                    )
             with errors_about(f"scenario {variant.label}"):
                 scenario.validate()
                 self._check_policies(variant, scenario.policy)
@@ -176,11 +169,6 @@ class StudyConfig:
                     "policies take one as LABEL=POLICY, scenarios that of their file"
                 )
 
-    def _check_own_policy(self, file: Path) -> None:
-        """Checks that a scenario's file has a policy, if it should fly."""
-        if self.flies_own_policies and not _has_own_policy(file):
-            raise ValueError(f"{file} has no `policy`, which --policies {SCENARIO} would fly")
-
     def unflown_policies(self, given: Collection[str] = ()) -> list[Path]:
         """Returns the files of scenarios with a policy of their own that the study does not fly;
         `given` scenarios have no file."""
@@ -213,35 +201,30 @@ def own_speeds(config: StudyConfig) -> list[float]:
     if config.policies != [SCENARIO]:
         return []
     files = {scenario_file(variant.scenario) for variant in config.scenario_variants}
-    speeds = [policy_speed(load_config(Scenario(), file).policy) for file in files]
-    is_one = speeds.count(speeds[0]) == len(speeds)
-    return [speed for speed in speeds[:1] if isinstance(speed, float) and is_one]
+    first, *others = [policy_speed(load_config(Scenario(), file).policy) for file in files]
+    is_one = isinstance(first, float) and all(speed == first for speed in others)
+    return [first] if is_one else []
 
 
-def _check_override(override: str, where: str) -> None:
-    """Checks that a field does not differ between the flights of a study."""
-    field, _, value = override.partition("=")
-    section, _, inner = field.partition(".")
-    remedy = {
-        "policy": f"policies, write --policies {f'NAME:{inner}={value}' if inner else 'NAME'}",
-        "seed": "seeds, give their number with --seeds",
-    }.get(section)
-    if remedy:
-        raise ValueError(
-            f"a study must not override {field}{where}, got {override!r}; its flights have their "
-            f"own {remedy}"
-        )
+def _check_overrides(overrides: Iterable[str], where: str) -> None:
+    """Checks that no field is set that differs between the flights of a study."""
+    for override in overrides:
+        field, _, value = override.partition("=")
+        section, _, inner = field.partition(".")
+        remedy = {
+            "policy": f"policies, write --policies {f'NAME:{inner}={value}' if inner else 'NAME'}",
+            "seed": "seeds, give their number with --seeds",
+        }.get(section)
+        if remedy:
+            raise ValueError(
+                f"a study must not override {field}{where}, got {override!r}; its flights have "
+                f"their own {remedy}"
+            )
 
 
 def parameter_rows(parameters: Any, samples: int | None = None) -> list[dict[str, Any]]:
-    """Returns rows of values, or distributions, by dotted fields of a scenario.
-
-    Args:
-        parameters: a table (a DataFrame, or a list of rows), whose missing values are left out; or
-            a grid (a dictionary of lists: all combinations), which may have distributions.
-        samples: number of values drawn from the distributions. By default these stay, and each
-            flight draws by its seed.
-    """
+    """Returns rows of values, or distributions, by dotted fields of a scenario; for the arguments
+    see `run_study.study`. Missing values of a table are left out."""
     if parameters is None:
         return [{}]
     if isinstance(parameters, Mapping):
@@ -257,14 +240,11 @@ def _grid(parameters: Mapping[str, Any], samples: int | None) -> list[dict[str, 
     for name, values in lists.items():
         valid = isinstance(values, Iterable) and not isinstance(values, str)
         require(valid, f"parameters[{name!r}]", "a list of values or a distribution", values)
-    require(samples is None or drawn, "samples", "None without distributions", samples)
-    require(samples is None or samples >= 1, "samples", "at least 1", samples)
     draws = [drawn]
     if samples is not None:
-        draws = [
-            {name: draw(distribution, seed, name) for name, distribution in drawn.items()}
-            for seed in range(samples)
-        ]
+        require(drawn, "samples", "None without distributions", samples)
+        require(samples >= 1, "samples", "at least 1", samples)
+        draws = [{name: draw(drawn[name], seed, name) for name in drawn} for seed in range(samples)]
     rows = [dict(zip(lists, values, strict=True)) for values in product(*lists.values())]
     return [row | values for row in rows for values in draws]
 
@@ -286,18 +266,14 @@ def scenario_texts(names: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> l
 def _text(value: Any) -> str:
     if is_distribution(value):
         return distribution_text(value)
-    plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-    plain = str(plain) if isinstance(plain, Path) else plain
-    return yaml_line(plain)
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    return yaml_line(str(value) if isinstance(value, Path) else value)
 
 
 def policy_texts(policies: Any) -> tuple[list[str], dict[str, MakeSystem], list[float]]:
-    """Converts the policies of `study`.
-
-    Returns:
-        Texts for `parse_variant`; functions that make systems, by label; speeds [m/s] of the
-        configurations.
-    """
+    """Converts the policies of `study` to texts for `parse_variant`, functions that make systems by
+    label, and speeds [m/s] of the configurations."""
     if policies is None:
         return [SCENARIO], {}, []
     if isinstance(policies, Mapping):
@@ -368,6 +344,5 @@ def named_scenarios(scenario: Any) -> tuple[list[str], dict[str, Scenario]]:
         return [name], {name: scenario}
     if isinstance(scenario, Mapping):
         return list(scenario), dict(scenario)
-    return [
-        str(name) for name in ([scenario] if isinstance(scenario, str | Path) else scenario)
-    ], {}
+    names = [scenario] if isinstance(scenario, str | Path) else scenario
+    return [str(name) for name in names], {}

@@ -21,7 +21,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -35,19 +35,9 @@ from splatpilot.analysis.benchmark.variants import LIVE, SCENARIO
 from splatpilot.diagrams.flight.policies import POLICIES, weights_file
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
+from splatpilot.diagrams.worlds import scene_folder
 from splatpilot.diagrams.worlds.file_worlds import MeshWorld
-from splatpilot.diagrams.worlds.scene_folder import (
-    CAPTURE,
-    ENVIRONMENT,
-    ESDF,
-    FRONTIER,
-    GAUSSIANS,
-    OBSERVATIONS,
-    PACKED_GAUSSIANS,
-    SceneSource,
-    find_scene,
-    read_scene_metadata,
-)
+from splatpilot.diagrams.worlds.scene_folder import SceneSource, find_scene
 from splatpilot.diagrams.worlds.splits import find_test_source, part_digests
 from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.config import dump_config, load_config, parse_config
@@ -70,7 +60,10 @@ _REQUIRED = {
     *("min_clearance_m", "jerk_m_s3"),
 }
 """Columns of all flights that were flown."""
-_SCENE_FILES = GAUSSIANS, PACKED_GAUSSIANS, ESDF, FRONTIER, ENVIRONMENT, OBSERVATIONS
+_SCENE_FILES = (
+    *(scene_folder.GAUSSIANS, scene_folder.PACKED_GAUSSIANS, scene_folder.ESDF),
+    *(scene_folder.FRONTIER, scene_folder.ENVIRONMENT, scene_folder.OBSERVATIONS),
+)
 """The files of a scene folder that flights depend on."""
 _OWN = "scenarios/"  # before the name of a scenario: label of the weights of its own policy
 _KNOWN = {"splatpilot", "__main__"} | sys.stdlib_module_names
@@ -92,21 +85,18 @@ class StudyFolder:
 
     def begin(self, config: StudyConfig, program: dict[str, str]) -> None:
         """Creates the folder, or checks that its study is the same, or a part of it."""
-        study = yaml.safe_load(dump_config(config))
         require_writable_folder(self.path)
         if (self.path / "study.yaml").is_file():
-            begun = yaml.safe_load(dump_config(StudyConfig())) | self._read()["study"]
-            for name, value in study.items():
+            begun = _mapping(StudyConfig()) | self._read()["study"]
+            for name, value in _mapping(config).items():
                 if begun[name] != value and not _is_part(name, begun[name], value):
                     raise ValueError(
                         f"{self.path} holds a study with {name} {begun[name]}, not {value}; choose "
                         "another folder, the same study, or one that has all of it and more"
                     )
+        elif any(self.path.iterdir()):
+            raise ValueError(f"{self.path} is not empty and holds no study; choose another folder")
         else:
-            if any(self.path.iterdir()):
-                raise ValueError(
-                    f"{self.path} is not empty and holds no study; choose another folder"
-                )
             self.record(config, program)
         for folder in ("scenarios", "scenes", "weights", "rollouts", "timings"):
             require_writable_folder(self.path / folder)
@@ -114,8 +104,8 @@ class StudyFolder:
 
     def record(self, config: StudyConfig, program: dict[str, str]) -> None:
         """Writes the study, which may have grown, and the program that flies it."""
-        study = yaml.safe_load(dump_config(config))
-        described = {"format_version": FORMAT_VERSION, "study": study, "program": program}
+        described = {"format_version": FORMAT_VERSION, "study": _mapping(config)}
+        described |= {"program": program}
         write_text(self.path / "study.yaml", yaml.safe_dump(described, sort_keys=False))
 
     def config(self) -> StudyConfig:
@@ -171,8 +161,8 @@ class StudyFolder:
             if row["outcome"] == INFEASIBLE:
                 missing = {"success", "reason"} - row.keys()
             else:
-                missing = _REQUIRED - row.keys()
-                shapes = {n: (len(arrays["times"]), *shape) for n, shape in _SHAPES.items()}
+                missing, count = _REQUIRED - row.keys(), len(arrays["times"])
+                shapes = {name: (count, *shape) for name, shape in _SHAPES.items()}
                 missing |= {name for name in ARRAYS if arrays[name].shape != shapes[name]}
             if missing:
                 raise ValueError(f"{min(missing)} is missing or invalid")
@@ -193,8 +183,12 @@ class StudyFolder:
         return timing if isinstance(timing, dict) else {}
 
 
+def _mapping(config: StudyConfig) -> dict[str, Any]:
+    return yaml.safe_load(dump_config(config))
+
+
 def _is_part(name: str, begun: Any, value: Any) -> bool:
-    """Checks that a study which has begun is a part of another, by a field of its configuration."""
+    """Checks that a study is a part of another, by a field of its configuration."""
     if name == "seeds":
         return begun <= value
     return name in ("scenarios", "policies", "speeds") and all(each in value for each in begun)
@@ -207,7 +201,7 @@ def require_test_scenes(scenarios: dict[str, Scenario]) -> None:
             continue
         scene = find_scene(scenario.world)
         if scene.is_dir():
-            split = read_scene_metadata(scene).split
+            split = scene_folder.read_scene_metadata(scene).split
         else:
             split = "test" if find_test_source(part_digests([scene.read_bytes()])) else ""
         what = f"split of {scene}, in which {name} flies,"
@@ -215,8 +209,7 @@ def require_test_scenes(scenarios: dict[str, Scenario]) -> None:
 
 
 def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, Scenario]) -> None:
-    """Copies scenarios, by name, their scenes, and weights into the folder, from which flights can
-    be replayed."""
+    """Copies scenarios, by name, their scenes, and weights into the folder, for replays."""
     for variant in config.variants:
         if variant.weights is not None:
             _keep_weights(folder, variant.weights, variant.label)
@@ -225,8 +218,7 @@ def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, S
         if isinstance(scenario.world, SceneSource):
             if (scene := find_scene(scenario.world)) not in scenes:
                 scenes[scene] = _keep_scene(folder, scene)
-            world = replace(scenario.world, path=scenes[scene])
-            scenario = replace(scenario, world=world)
+            scenario = replace(scenario, world=replace(scenario.world, path=scenes[scene]))
         weights = getattr(scenario.policy, "weights", "")
         if config.flies_own_policies and weights:
             kept = _keep_weights(folder, Path(weights), _OWN + name)  # relative to the folder
@@ -249,14 +241,13 @@ def _keep_scene(folder: StudyFolder, scene: Path) -> str:
                 f"{scene} differs from {kept}, a scene of the same name; rename it, or choose "
                 "another folder with --out"
             )
+    elif scene.is_dir():
+        with folder_written_atomically(kept) as partial:
+            ignored = shutil.ignore_patterns(scene_folder.CAPTURE)
+            shutil.copytree(scene, partial, dirs_exist_ok=True, ignore=ignored)
     else:
-        if scene.is_dir():
-            with folder_written_atomically(kept) as partial:
-                ignored = shutil.ignore_patterns(CAPTURE)
-                shutil.copytree(scene, partial, dirs_exist_ok=True, ignore=ignored)
-        else:
-            with written_atomically(kept) as partial:
-                shutil.copyfile(scene, partial)
+        with written_atomically(kept) as partial:
+            shutil.copyfile(scene, partial)
     return str(kept.relative_to(folder.path))
 
 
@@ -293,11 +284,7 @@ def kept_flights(
     folder: StudyFolder, specs: Iterable[RolloutSpec]
 ) -> Iterator[tuple[RolloutSpec, Scenario]]:
     """Yields flights with their scenario, policy and seed, from the study's folder alone.
-
-    Distributions are not yet drawn, see `sample_scenario`.
-
-    Raises ValueError for a policy whose module is not imported; files never import modules.
-    """
+    Distributions are not yet drawn, and modules of policies must be imported."""
     config, specs = folder.config(), list(specs)
     overrides = {each.label: each.policy_overrides for each in config.scenario_variants}
     variants, flown = {}, {spec.policy for spec in specs}
@@ -312,12 +299,9 @@ def kept_flights(
             kept = folder.weights(variant.label, weights.suffix)
             variant = variant.with_weights(kept.absolute())
         variants[variant.label] = variant
-    scenarios: dict[str, Scenario] = {}
+    read = cache(partial(kept_scenario, folder))
     for spec in specs:
-        if spec.scenario not in scenarios:
-            scenarios[spec.scenario] = kept_scenario(folder, spec.scenario)
-        scenario = scenarios[spec.scenario]
-        inner = overrides[spec.scenario]
+        scenario, inner = read(spec.scenario), overrides[spec.scenario]
         policy = variants[spec.policy].config(spec.speed, scenario.policy, inner)
         yield spec, replace(scenario, policy=policy, seed=spec.seed)
 
@@ -331,9 +315,7 @@ def input_digests(config: StudyConfig, scenarios: dict[str, Scenario]) -> dict[s
             key = f"weights of {variant.label}"
             if variant.policy == SCENARIO:
                 key += f" in {name}"
-            if variant.policy == LIVE:
-                continue
-            if key not in digests:
+            if variant.policy != LIVE and key not in digests:
                 file = weights_file(variant.config(config.speeds[0], scenario.policy))
                 if file is not None:
                     digests[key] = _digest([file])
@@ -342,15 +324,14 @@ def input_digests(config: StudyConfig, scenarios: dict[str, Scenario]) -> dict[s
                 digests[f"scene of {name}"] = _digest(_scene_files(find_scene(scenario.world)))
             elif isinstance(scenario.world, MeshWorld):
                 mesh = find_data(Path(scenario.world.path), "a mesh")
-                parts = sorted(file for file in mesh.parent.iterdir() if file.stem == mesh.stem)
-                digests[f"scene of {name}"] = _digest([file for file in parts if file.is_file()])
+                parts = sorted(each for each in mesh.parent.iterdir() if each.stem == mesh.stem)
+                digests[f"scene of {name}"] = _digest(filter(Path.is_file, parts))
     return digests
 
 
-def _scene_files(scene: Path) -> list[Path]:
-    """Returns the files of a scene that flights depend on."""
+def _scene_files(scene: Path) -> Iterable[Path]:
     files = [scene / file for file in _SCENE_FILES] if scene.is_dir() else [scene]
-    return [file for file in files if file.is_file()]
+    return filter(Path.is_file, files)
 
 
 def plugin_digests(scenarios: Iterable[Scenario]) -> dict[str, str]:
@@ -395,13 +376,11 @@ def _source_digest(package: str) -> str:
     module = sys.modules[package]
     folders = [Path(folder) for folder in getattr(module, "__path__", ())]
     files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
-    if not folders and getattr(module, "__file__", None):
-        files = [Path(str(module.__file__))]
+    if not folders and (file := getattr(module, "__file__", None)):
+        files = [Path(file)]
     return _digest(files)
 
 
-def _digest(files: list[Path]) -> str:
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
-    return digest.hexdigest()[:16]
+def _digest(files: Iterable[Path]) -> str:
+    parts = (hashlib.sha256(file.read_bytes()).digest() for file in files)
+    return hashlib.sha256(b"".join(parts)).hexdigest()[:16]

@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,11 +38,8 @@ class Interval(NamedTuple):
 
 
 def wilson_interval(successes: float, flights: float, confidence: float = 0.95) -> Interval:
-    """Returns the score interval of a success rate (E. B. Wilson, 1927); [0, 1] without flights.
-
-    Args:
-        flights: number of independent flights, which `effective_flights` counts.
-    """
+    """Returns the score interval of a success rate (E. B. Wilson, 1927) of independent flights, see
+    `effective_flights`; [0, 1] without flights."""
     if flights == 0:
         return Interval(0.0, 1.0)
     p, z2 = successes / flights, float(norm.ppf((1 + confidence) / 2)) ** 2
@@ -226,40 +223,39 @@ def success_summary(rows: list[Row], bases: Mapping[str, str] | None = None) -> 
     Args:
         bases: names of the scenarios without changed fields, by those of their variants.
     """
-    flights, wins = (_count(rows, lambda row: row["scenario"], won) for won in (False, True))
-    worlds, won = (_count(rows, _world, won) for won in (False, True))
-    named = {name: name for name in flights} | dict(bases or {})
-    base, base_wins = (
-        _count(rows, lambda row: named[row["scenario"]], won) for won in (False, True)
+    wins, flights = _count(rows, lambda row: row["scenario"])
+    named = dict(bases or {})
+    clusters = cluster_interval(
+        *_count(rows, lambda row: named.get(row["scenario"], row["scenario"]))
     )
-    clusters = cluster_interval([base_wins[name] for name in base], list(base.values()))
-    effective = effective_flights([won[name] for name in worlds], list(worlds.values()))
     return (
-        _success(wins.total(), len(rows), effective)
+        _success(sum(wins), len(rows), effective_flights(*_count(rows, _world)))
         | {"cluster_lower": clusters.lower, "cluster_upper": clusters.upper}
         | {str(outcome): sum(row["outcome"] == outcome for row in rows) for outcome in FAILURES}
         | {"scenarios": len(flights)}
-        | {"scenarios_passed": sum(2 * wins[name] > count for name, count in flights.items())}
+        | {"scenarios_passed": sum(2 * k > n for k, n in zip(wins, flights, strict=True))}
     )
 
 
-def _count(rows: list[Row], key: Callable[[Row], str], successes: bool) -> Counter[str]:
-    return Counter(key(row) for row in rows if row["success"] or not successes)
+def _count(rows: list[Row], key: Callable[[Row], str]) -> tuple[list[int], list[int]]:
+    """Returns the numbers of successes and of flights with each value of a key."""
+    flights = Counter(map(key, rows))
+    wins = Counter(key(row) for row in rows if row["success"])
+    return [wins[name] for name in flights], list(flights.values())
 
 
 def policy_table(rows: list[Row], config: StudyConfig, absent: int = 0) -> list[Row]:
     """Returns a row for each policy and speed: `success_summary`, the number of flights not run in
     `absent` scenarios, and the means of `METRICS`."""
     table, bases = [], {each.label: each.base for each in config.scenario_variants}
-    for policy in config.policy_names:
-        for speed in config.speeds:
-            flown = select(rows, policy=policy, speed=speed)
-            table.append(
-                {"policy": policy, "speed": speed}
-                | success_summary(flown, bases)
-                | {"not_run": absent * config.seeds}
-                | {name: mean_column(flown, name) for name in METRICS}
-            )
+    for policy, speed in product(config.policy_names, config.speeds):
+        flown = select(rows, policy=policy, speed=speed)
+        table.append(
+            {"policy": policy, "speed": speed}
+            | success_summary(flown, bases)
+            | {"not_run": absent * config.seeds}
+            | {name: mean_column(flown, name) for name in METRICS}
+        )
     return table
 
 
@@ -271,13 +267,11 @@ def external_table(rows: list[Row], config: StudyConfig) -> list[Row]:
         if scenario not in PUBLISHED:
             continue
         entries: list[tuple] = [(method, None, *rest) for method, *rest in PUBLISHED[scenario]]
-        for policy in config.policy_names:
-            for speed in config.speeds:
-                flown = select(rows, scenario=scenario, policy=policy, speed=speed)
-                successes = sum(row["success"] for row in flown)
-                mean_speed = mean_column(flown, "mean_speed_m_s")
-                flights = courses = len(flown)
-                entries.append((policy, speed, mean_speed, successes, flights, courses))
+        for policy, speed in product(config.policy_names, config.speeds):
+            flown = select(rows, scenario=scenario, policy=policy, speed=speed)
+            successes = sum(row["success"] for row in flown)
+            mean_speed, flights = mean_column(flown, "mean_speed_m_s"), len(flown)
+            entries.append((policy, speed, mean_speed, successes, flights, flights))
         for policy, speed, mean_speed, *counts in entries:
             row = {"scenario": scenario, "policy": policy, "speed": speed}
             table.append(row | {"mean_speed_m_s": mean_speed} | _success(*counts))
@@ -302,13 +296,8 @@ def compare(rows: list[Row], config: StudyConfig) -> list[Comparison]:
     bases = {each.label: each.base for each in config.scenario_variants}
     pairs = []
     for speed in config.speeds:
-        flown = {
-            name: sorted(
-                select(rows, policy=name, speed=speed),
-                key=lambda row: (row["scenario"], row["seed"]),
-            )
-            for name in config.policy_names
-        }
+        ordered = sorted(rows, key=lambda row: (row["scenario"], row["seed"]))
+        flown = {name: select(ordered, policy=name, speed=speed) for name in config.policy_names}
         for names in combinations(config.policy_names, 2):
             first, second = (np.array([r["success"] for r in flown[name]], bool) for name in names)
             worlds = [_world(row) for row in flown[names[0]]]
@@ -317,9 +306,8 @@ def compare(rows: list[Row], config: StudyConfig) -> list[Comparison]:
             difference = first.astype(float) - second
             if len(set(worlds)) < len(worlds):
                 p_seeds = sign_flip(_sum_by(worlds, difference))
-            p_scenarios = sign_flip(
-                _sum_by(kinds, difference) / _sum_by(kinds, np.ones(len(kinds)))
-            )
+            counts = _sum_by(kinds, np.ones(len(kinds)))
+            p_scenarios = sign_flip(_sum_by(kinds, difference) / counts)
             pairs.append(Comparison(*names, speed, only_first, only_second, p_seeds, p_scenarios))
     for name in ("p_seeds", "p_scenarios"):
         adjusted = holm([getattr(pair, name) for pair in pairs])

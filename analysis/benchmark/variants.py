@@ -49,11 +49,8 @@ class Variant(NamedTuple):
         return self._replace(overrides=(*self.overrides, _WEIGHTS + json.dumps(str(file))))
 
     def config(self, speed: float, own: Any, overrides: Sequence[str] = ()) -> Any:
-        """Returns the configuration for a nominal speed [m/s]; `own` is the scenario's policy.
-
-        Args:
-            overrides: of the scenario, after those of the variant.
-        """
+        """Returns the configuration for a nominal speed [m/s]; `own` is the scenario's policy, and
+        its `overrides` come after those of the variant."""
         # The command line parses variants before slow imports.
         from splatpilot.diagrams.flight.policies import policy_named
         from splatpilot.systems.common.config import load_config
@@ -95,11 +92,8 @@ class ScenarioVariant(NamedTuple):
 
 
 def parse_scenario(text: str) -> ScenarioVariant:
-    """Parses `[LABEL=]SCENARIO[:FIELD=VALUE[:FIELD=VALUE...]]`.
-
-    The default label is the name of the scenario or file with the fields that are set, or with a
-    digest of them if that is too long: `P02:world.spacing=2` is labeled `P02-world.spacing-2`.
-    """
+    """Parses `[LABEL=]SCENARIO[:FIELD=VALUE...]`; the default label is `default_label`, so
+    `P02:world.spacing=2` is labeled `P02-world.spacing-2`."""
     label, _, rest = text.partition("=")
     if not (rest and _LABEL.fullmatch(label)):
         label, rest = "", text
@@ -120,11 +114,8 @@ def default_label(name: str, overrides: Sequence[str]) -> str:
 
 
 def parse_variant(text: str) -> Variant:
-    """Parses `[LABEL=]POLICY[:FIELD=VALUE[:FIELD=VALUE...]]`.
-
-    The default label is the name of the policy, class or file with the fields that are set:
-    `reactive:margin=0.2` is labeled `reactive-margin-0.2`.
-    """
+    """Parses `[LABEL=]POLICY[:FIELD=VALUE...]`; the default label is the name of the policy, class
+    or file with the fields that are set: `reactive-margin-0.2`."""
     label, _, rest = text.partition("=")
     if text.startswith("="):
         raise ValueError(f"the policy {text[:100]!r} has no label before its =; give it one")

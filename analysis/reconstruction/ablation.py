@@ -33,27 +33,18 @@ from splatpilot.training.reconstruction.initialize import MAX_STEPS, held_out_fr
 from splatpilot.training.reconstruction.metrics import floaters
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 
-COLUMNS = (
-    "psnr_db",
-    "ssim",
-    "lpips",
-    "depth_mae_m",
-    "floater_fraction",
-    "hole_fraction",
-    "psnr_on_black_db",
-)
+COLUMNS = ("psnr_db", "ssim", "lpips", "depth_mae_m")
+COLUMNS += ("floater_fraction", "hole_fraction", "psnr_on_black_db")
+_FROM_DEPTH: dict[str, Any] = {"initialization": "depth"}
 _NO_DEPTH_LOSSES = {"depth_weight": 0.0, "surface_weight": 0.0, "outline_weight": 0.0}
 _STEPS: dict[str, tuple[str, dict[str, Any]]] = {
     "points": (
         "from points, photometric",
         {"initialization": "points", "strategy": "default", **_NO_DEPTH_LOSSES},
     ),
-    "depth_start": ("from depth, photometric", {"initialization": "depth", **_NO_DEPTH_LOSSES}),
-    "surfaces": (
-        "+ surface and outline losses",
-        {"initialization": "depth", "depth_weight": 0.0},
-    ),
-    "depth_term": ("+ depth term", {"initialization": "depth"}),
+    "depth_start": ("from depth, photometric", _FROM_DEPTH | _NO_DEPTH_LOSSES),
+    "surfaces": ("+ surface and outline losses", _FROM_DEPTH | {"depth_weight": 0.0}),
+    "depth_term": ("+ depth term", _FROM_DEPTH),
 }
 """Titles of the steps from one arm of a representation to the next, and the settings of the arm
 that differ from the study's."""
@@ -99,9 +90,8 @@ class AblationResult:
         """Returns the effect of each step on each capture."""
         lines = []
         for name, arms in self.captures.items():
-            for plain, other in pairwise(ARMS):
-                if plain.representation != other.representation:
-                    continue
+            same = (p for p in pairwise(ARMS) if p[0].representation == p[1].representation)
+            for plain, other in same:
                 before, after = arms[plain.key], arms[other.key]
                 gain = (after.mean("psnr_db") or 0) - (before.mean("psnr_db") or 0)
                 lines.append(
@@ -160,15 +150,10 @@ class AblationStudy:
 
 
 def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
-    """Returns the settings of an arm. The last of a representation follows `config`; the first uses
-    no metric depth, but for photometry and the least size of Gaussians. All have the same steps,
-    images and photometry."""
-    return replace(
-        config,
-        representation=arm.representation,
-        distance_field="captured",
-        **_STEPS[arm.step][1],
-    )
+    """Returns the settings of an arm, with the same steps, images and photometry. The first of a
+    representation uses no other metric depth, but for the smallest size of Gaussians."""
+    own = {"representation": arm.representation, "distance_field": "captured"}
+    return replace(config, **own, **_STEPS[arm.step][1])
 
 
 @locks_folder("out")
@@ -262,22 +247,22 @@ def _write_tables(out: Path, result: AblationResult, config: ReconstructConfig) 
 
 
 def _write_grid(path: Path, capture: Capture, out: Path, result: AblationResult) -> None:
-    """Writes the image grid of one held-out frame in the paper's arms: that with the median
-    fraction of floaters in 3DGS from points."""
+    """Writes the image grid of the frame of median floaters in 3DGS from points, in the paper's
+    arms."""
     arms = result.captures[capture.name]
     frames = arms["3dgs_points"].frames
     ordered = sorted(frames, key=lambda i: frames[i].floater_fraction or 0.0)
     i = ordered[len(ordered) // 2]
     drawn = sorted(PAPER, key=lambda arm: (arm.step != "points", arm.key))
     depths, errors = None, figures.error_scale(_ERROR_LIMIT)
-    rows: list[list[figures.Panel | None]] = [[], [], [], []]
+    rows: list[list[figures.Panel | None]] = []
     for arm in drawn:
         views = SceneViews(out / arm.key, capture)
         frame, found = views.frame(i), arms[arm.key].frames[i]
         depths = depths or figures.depth_scale([frame.depth])
         labels = format_metric(found.psnr_db, "{:.1f} dB"), f"{found.depth_mae_m or 0.0:.2f} m"
         truth, image, true_depth, *depth = views.panels(frame, depths, errors, labels)
-        if not rows[0]:
+        if not rows:
             rows = [[truth], [None], [true_depth], [None]]
         marked = figures.mark_floaters(
             image.image, floaters(views.render(frame).depth, frame.depth)

@@ -64,8 +64,7 @@ class Band:
 
 
 def band(x: ArrayLike, y: ArrayLike) -> Band:
-    """Groups samples by x: a group for each value or, for more than 16, up to 16 groups of equal
-    numbers of samples, at least 5 each."""
+    """Groups samples by x: one for each value or, if more, up to 16 of equally many, at least 5."""
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     values, which = np.unique(np.round(x, 6), return_inverse=True)
     if len(values) <= _MAX_GROUPS:
@@ -79,16 +78,15 @@ def band(x: ArrayLike, y: ArrayLike) -> Band:
 
 
 def reach(x: ArrayLike, y: ArrayLike, limit: float) -> float:
-    """Returns the largest x up to which the non-decreasing least-squares fit to the medians of
-    `band`, linear in between, is within `limit`; 0 if the fit starts above."""
+    """Returns the `first_crossing` of the non-decreasing least-squares fit to medians of `band`."""
     found = band(x, y)
     fit = isotonic_regression(found.middle, weights=found.counts).x
     return first_crossing(found.at, fit, limit)
 
 
 def first_crossing(x: ArrayLike, y: Iterable[float], limit: float) -> float:
-    """Returns the rising x up to which the values y, linear in between, are within `limit`; 0 if
-    the first is not. It takes no values beyond."""
+    """Returns the rising x up to which the values y, linear in between and taken one by one, are
+    within `limit`; 0 if the first is not."""
     x = np.asarray(x, np.float64)
     before = 0.0
     for k, value in enumerate(y):
@@ -155,9 +153,8 @@ class FidelityStudy:
         kept = self.column("depth_relative") <= self.max_depth_error
         kept &= self._psnr_drop <= self.max_psnr_drop
         trusted = self.column("unseen") <= self.unseen_limit
-        inside, outside = (
-            float(kept[mask].mean()) if mask.any() else float("nan") for mask in (trusted, ~trusted)
-        )
+        both = (kept[trusted], kept[~trusted])
+        inside, outside = (float(k.mean()) if len(k) else float("nan") for k in both)
         return inside, outside
 
     def __str__(self) -> str:
@@ -221,9 +218,7 @@ def drop_frames(capture: Capture, held_out: Sequence[int]) -> Capture:
     )
 
 
-def displace_pose(
-    X_WCs: Sequence[RigidTransform], i: int, offset: float
-) -> tuple[RigidTransform, RigidTransform, RigidTransform, RigidTransform]:
+def displace_pose(X_WCs: Sequence[RigidTransform], i: int, offset: float) -> list[RigidTransform]:
     """Returns pose i of a path moved by `offset` [m] left, right, up and down. Left is horizontal
     and perpendicular to the path or, if that is vertical or at rest, along the camera's -x axis."""
     before, after = X_WCs[max(i - 1, 0)], X_WCs[min(i + 1, len(X_WCs) - 1)]
@@ -234,16 +229,14 @@ def displace_pose(
     left = offset * left / np.linalg.norm(left)
     up = np.array([0.0, 0.0, offset])
     R_WC, p_WC = X_WCs[i].rotation(), X_WCs[i].translation()
-    steps = (left, -left, up, -up)
-    a, b, c, d = (RigidTransform(R_WC, p_WC + step) for step in steps)
-    return a, b, c, d
+    return [RigidTransform(R_WC, p_WC + step) for step in (left, -left, up, -up)]
 
 
 class ViewSupport:
-    """The fraction of a view's pixels whose surface a fitted camera saw similarly. One of the 16
-    closest cameras saw the point at the depth of the scene (within 5 %), from a direction within 45
-    degrees and from at most twice the distance. `camera` is K (3, 3), width and height [px]; pixels
-    without a surface count, unless the capture saw the sky."""
+    """The fraction of a view's pixels whose surface one of the 16 closest fitted cameras saw at the
+    depth of the scene (within 5 %), from a direction within 45 degrees and at most twice the
+    distance. `camera` is K (3, 3), width and height [px]; pixels without a surface count, unless
+    the capture saw the sky."""
 
     def __init__(
         self,
@@ -354,9 +347,9 @@ def run(
     find_camera: Callable[[Path], TrueCamera | None] = true_camera,
     overwrite: bool = False,
 ) -> list[FidelityStudy]:
-    """Studies scene folders, and writes the bounds into their `scene.yaml` and `fidelity.png`,
-    `fidelity.csv`, `fidelity.yaml` and image grids into `out`. `find_camera` returns the camera
-    that renders the truth of a capture's folder, or None."""
+    """Studies scene folders; writes bounds into their `scene.yaml`, and tables, curves and image
+    grids into `out`. `find_camera` returns the camera that renders the truth of a capture, if any.
+    """
     config.validate()
     names = [scene.resolve().name for scene in scenes]
     if len(set(names)) < len(names):
@@ -372,8 +365,7 @@ def run(
     sources = {str(scene.resolve()): about.provenance for scene, about in metadata.items()}
     claim_folder(file, StudiedScenes(sources, config), overwrite)
     studies = []
-    kept = f"what was reconstructed is in {out}; the same command uses it again"
-    with resumable(lambda: kept):
+    with resumable(lambda: f"what was reconstructed is in {out}; the same command uses it again"):
         for scene, name in zip(scenes, names, strict=True):
             study = study_scene(scene, out / name, config, find_camera)
             bounds = store_bounds(scene, study)
@@ -439,12 +431,9 @@ def study_scene(
 
 
 def store_bounds(scene: Path, study: FidelityStudy) -> SceneMetadata:
-    """Writes the maximum displacement [m] of each pose, and of all poses, into `scene.yaml`.
-
-    A pose may move left, right, up and down while its view keeps within the study's limit of unseen
-    pixels, at most as far as was measured. The bound of all poses is the reach or, of held-out
-    frames, the median over the poses.
-    """
+    """Writes the maximum displacement [m] of each pose, left, right, up and down within the study's
+    limit of unseen pixels and the farthest sample, and of all poses, which is the reach or, of
+    held-out frames, the median over the poses, into `scene.yaml`."""
     views = SceneViews(scene)
     support, X_WCs = _support(views), views.capture.X_WCs
     farthest = study.column("offset").max()
@@ -507,8 +496,7 @@ def _held_out_frames(
 
 
 def write_curves(path: Path, studies: Sequence[FidelityStudy]) -> None:
-    """Draws PSNR and depth errors of each scene against the offset from the path: medians with the
-    10th to 90th percentile, the limits, and the reach as a vertical line."""
+    """Draws PSNR and depth errors against the offset from the path: bands, limits and reach."""
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     axes = figure.subplots(1, 3)
     panels = (

@@ -9,17 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from splatpilot.analysis.figures import (
-    Panel,
-    Scale,
-    colorize,
-    depth_scale,
-    error_scale,
-    write_grid,
-)
+from splatpilot.analysis import figures
+from splatpilot.analysis.figures import Panel, Scale, colorize
 from splatpilot.diagrams.worlds import scene_folder
 from splatpilot.diagrams.worlds.observed_routes import ObservedViews
-from splatpilot.diagrams.worlds.scene_folder import CAPTURE, check_scene_target, read_scene_metadata
 from splatpilot.systems.common.files import locked_folder, require_unused, write_text
 from splatpilot.systems.common.processes import require_renderer
 from splatpilot.systems.common.progress import Progress, resumable
@@ -212,14 +205,13 @@ class SceneViews:
 
 
 def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMetrics:
-    """Measures a scene folder on its held-out frames or, without any, on every eighth frame, and
-    writes `metrics.json` and `views.png` into it."""
+    """Measures a scene folder on the frames `SceneViews.measured`, and writes `metrics.json` and
+    `views.png` into it."""
     views = SceneViews(scene, capture)
-    lpips, missing = None, ""
     try:
-        lpips = Lpips()
+        lpips, missing = Lpips(), ""
     except (OSError, ValueError) as error:
-        missing = str(error)
+        lpips, missing = None, str(error)
     fitted = [ThinnedFrame.of(views.frame(i)) for i in views.fitted]
     gains = views.metadata.gains or [1.0] * len(views.capture)
     frames, strict = {}, {}
@@ -265,9 +257,9 @@ def _write_views(path: Path, views: SceneViews, metrics: SceneMetrics) -> None:
     picked = sorted({indices[k] for k in np.linspace(0, len(indices) - 1, _MAX_ROWS).astype(int)})
     frames = [views.frame(i) for i in picked]
     true = [frame.depth for frame in frames if has_true_depth(frame.depth).any()]
-    depths = depth_scale(true or [views.render(frame).depth for frame in frames])
+    depths = figures.depth_scale(true or [views.render(frame).depth for frame in frames])
     middle = np.median([np.median(frame.depth) for frame in frames])
-    errors = error_scale(_ERROR_LIMIT * float(middle) if 0 < middle < np.inf else 0.1)
+    errors = figures.error_scale(_ERROR_LIMIT * float(middle) if 0 < middle < np.inf else 0.1)
     rows = []
     for i, frame in zip(picked, frames, strict=True):
         found = metrics.frames[i]
@@ -280,12 +272,11 @@ def _write_views(path: Path, views: SceneViews, metrics: SceneMetrics) -> None:
         kept = 0, 1, 3
         columns, rows = [columns[k] for k in kept], [[row[k] for k in kept] for row in rows]
         scales = [depths]
-    write_grid(path, rows, columns, [f"frame {i}" for i in picked], scales)
+    figures.write_grid(path, rows, columns, [f"frame {i}" for i in picked], scales)
 
 
 def unseen_fraction(scene: Path) -> float | None:
-    """Returns the mean fraction of `ObservedViews` along the route from start to goal; None without
-    a route."""
+    """Returns the mean fraction of `ObservedViews` along the route to the goal, if there is one."""
     metadata = scene_folder.read_scene_metadata(scene)
     if not metadata.metric:
         return None
@@ -315,14 +306,14 @@ def unseen_fraction(scene: Path) -> float | None:
 class RenderedSceneConfig(ReconstructConfig):
     """Settings of a mesh or a generated world: its capture and reconstruction."""
 
-    render: RenderConfig = field(default_factory=lambda: RenderConfig())
+    render: RenderConfig = field(default_factory=RenderConfig)
     voxel_size: float = bounded(0.1, "[0, inf) m")
     """[m], of the distance field; the planner searches a hall in seconds."""
 
     def reconstruct(self) -> ReconstructConfig:
         """Returns the part of the reconstruction."""
-        names = (each.name for each in fields(ReconstructConfig))
-        return ReconstructConfig(**{name: getattr(self, name) for name in names})
+        rest = {name: value for name, value in vars(self).items() if name != "render"}
+        return ReconstructConfig(**rest)
 
 
 def make_rendered_scene(
@@ -334,10 +325,10 @@ def make_rendered_scene(
     restart: bool = False,
     overwrite: bool = False,
 ) -> tuple[ReconstructSummary, SceneMetrics]:
-    """Renders a mesh or a scenario's generated world to `out/capture` and makes the scene `out` of
-    it; see `render_capture.run` and `make_scene`. A capture of the same settings is used again."""
-    check_scene_target(out)
-    capture = Path(out) / CAPTURE
+    """Renders a mesh or a scenario's generated world to `out/capture`, if that is not there, and
+    makes the scene `out` of it; see `render_capture.run` and `make_scene`."""
+    scene_folder.check_scene_target(out)
+    capture = Path(out) / scene_folder.CAPTURE
     render_capture.run(world=world, out=capture, config=config.render, seed=seed)
     options = {"restart": restart, "overwrite": overwrite}
     return make_scene(capture=capture, out=out, config=config.reconstruct(), **options)
@@ -352,17 +343,17 @@ def make_scene(
     overwrite: bool = False,
 ) -> tuple[ReconstructSummary, SceneMetrics]:
     """Reconstructs the capture in a folder as the scene folder `out`, measures it and prints the
-    results; see `reconstruct` and `measure_scene`. With `overwrite` it replaces another scene."""
+    results; see `reconstruct` and `measure_scene`."""
     out = Path(out)
     # Before photographs are registered, which takes minutes.
     config.validate()
     require_renderer(config.device)
-    check_scene_target(out)
+    scene_folder.check_scene_target(out)
     if (out / VIEWS).exists():
         require_unused(out, overwrite)
     opened = read_capture(capture, config.capture)
     if (out / "scene.yaml").is_file() and not (out / VIEWS).exists():
-        about = read_scene_metadata(out)
+        about = scene_folder.read_scene_metadata(out)
         made_from = about.capture, about.capture_settings
         if made_from != (opened.folder, opened.config.settings()):  # not to be measured only
             require_unused(out, overwrite)

@@ -34,10 +34,8 @@ from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.distance_field import keep_confirmed, render_depth
 from splatpilot.training.reconstruction.reconstruct import with_default_route
 
-_KEPT = (
-    *("gains", "vignetting", "representation", "capture", "capture_settings", "capture_notes"),
-    *("origin", "held_out", "image_width", "split", "source_digest"),
-)
+_KEPT = ("gains", "vignetting", "representation", "capture", "capture_settings", "capture_notes")
+_KEPT += ("origin", "held_out", "image_width", "split", "source_digest")
 """Metadata that a scaled scene keeps."""
 _MIN_AREA = 0.05  # twice the area of a triangle on the floor, over its longest side squared
 _MIN_COSINE = 0.5  # between a floor's normal and the axis that is up
@@ -68,8 +66,7 @@ def rescale_file(
     file: Path, out: Path, factor: float, up: str, floor: Sequence[ArrayLike]
 ) -> RescaleSummary:
     """Writes the Gaussians of a file as PLY, glTF or USD, in meters. Its axis `up` becomes z, or y
-    of glTF. If `floor` has three points (3,), their plane becomes z = 0, and `up` tells its upper
-    side."""
+    of glTF; the plane of three points (3,) of `floor`, if given, becomes z = 0."""
     suffix = out.suffix.lower()
     require(suffix in WRITTEN, f"{out}: the suffix", f"one of {', '.join(WRITTEN)}", repr(suffix))
     if out.exists():
@@ -125,9 +122,8 @@ def run(
     up: str | None = None,
     floor: Sequence[ArrayLike] = (),
 ) -> RescaleSummary:
-    """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`. The factor is
-    given, or follows from the distance between two points (3,) or from the median height of the
-    capture's cameras [m]."""
+    """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`, by a factor, or
+    the distance between two points (3,) or the median height of the capture's cameras [m]."""
     is_file = scene.is_file() or sog_meta(scene) is not None
     if is_file and height is not None:
         raise ValueError(f"{scene}: a file has no cameras; give a factor, or points and a distance")
@@ -155,8 +151,8 @@ def run(
 
 
 def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
-    """Writes a scene folder with all lengths times `factor`, with start and goal for the vehicle
-    and a closed frontier. Metrics are not copied."""
+    """Writes a scene folder with all lengths times `factor`, a closed frontier and new start and
+    goal, without metrics."""
     _positive("factor", factor)
     if out.exists():
         raise ValueError(f"{out}: exists already; choose another folder for the scaled scene")
@@ -213,8 +209,8 @@ def _with_free_path(field: Esdf, X_WCs: Sequence[RigidTransform]) -> Esdf:
 def _about_capture(
     metadata: scene_folder.SceneMetadata, factor: float
 ) -> tuple[scene_folder.SceneMetadata, tuple[str, ...]]:
-    """Returns the metadata of a scaled scene about its capture, and warnings. It forgets a capture
-    whose measured depth gives the scale."""
+    """Returns the metadata of a scaled scene about its capture, which is forgotten if its depth
+    gives the scale, and warnings."""
     metadata = replace(metadata, origin=[factor * x for x in metadata.origin])
     if not metadata.capture:
         return metadata, ()
