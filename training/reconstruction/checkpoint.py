@@ -61,8 +61,8 @@ def kept_work(out: Path) -> str:
 
 
 class Checkpoint:
-    """The file with the state of an optimization of the scene folder `out`, in `work_folder(out)`.
-    Without the fitted `views`, it compares only the config with that of the checkpoint."""
+    """The file with the state of an optimization, in `work_folder(out)`. Without the fitted
+    `views`, it compares only the config with that of the checkpoint."""
 
     def __init__(
         self, out: Path, config: ReconstructConfig, views: ReconstructionViews | None = None
@@ -109,8 +109,7 @@ class Checkpoint:
 
 @contextmanager
 def event_log(folder: str) -> Iterator[Callable[[int, dict[str, float]], None]]:
-    """Yields a function that logs metrics of a step for tensorboard; without a folder, it does
-    nothing."""
+    """Yields a function that logs metrics of a step for tensorboard, or ignores them."""
     if not folder:
         yield lambda step, metrics: None
         return

@@ -56,8 +56,8 @@ def captured_depth(capture: Capture, indices: Sequence[int]) -> DepthSource:
 def render_depth(
     capture: Capture, factor: int, gaussians: GaussianScene, representation: str, threads: int
 ) -> DepthSource:
-    """Renders the median depth that the cameras of a capture measure in the scene, 0 without a
-    surface and in invalid pixels, in images shrunk by an integer `factor`."""
+    """Renders the median depth of the scene in the cameras of a capture, shrunk by an integer
+    `factor`; 0 without a surface and in invalid pixels."""
     K = capture.K.copy()
     K[:2] /= factor
     width, height = capture.width // factor, capture.height // factor
@@ -72,8 +72,7 @@ def render_depth(
 
 
 def add_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:
-    """Returns rendered depth that is infinite where nothing is rendered and the fitted frame shows
-    the sky, which frees the space before it."""
+    """Returns rendered depth, infinite where only the fitted frame's sky is, which frees space."""
     positions = {number: k for k, number in enumerate(frames.numbers)}
 
     def load(i: int) -> NDArray[np.float32]:
@@ -83,19 +82,18 @@ def add_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:
         sky = (depth == 0) & (frames[positions[i]].depth >= FAR)
         return np.where(sky, np.float32(np.inf), depth)
 
-    return DepthSource(load, rendered.K, rendered.X_WCs)
+    return replace(rendered, load=load)
 
 
 def keep_confirmed(rendered: DepthSource, voxel_size: float) -> DepthSource:
-    """Returns rendered depth without that which photographs do not determine, see
-    `ConfirmedSurfaces`."""
+    """Returns rendered depth that photographs determine, see `ConfirmedSurfaces`."""
     images = rendered.images("confirming surfaces")
     surfaces = ConfirmedSurfaces(images, rendered.K, rendered.X_WCs, voxel_size)
 
     def load(i: int) -> NDArray[np.float32]:
         return surfaces.keep(rendered.load(i), rendered.X_WCs[i])
 
-    return DepthSource(load, rendered.K, rendered.X_WCs)
+    return replace(rendered, load=load)
 
 
 @dataclass(frozen=True)
@@ -109,8 +107,7 @@ class FieldGrid:
 
 
 def choose_grid(source: DepthSource, metric: bool, config: ReconstructConfig) -> FieldGrid:
-    """Returns the grid that holds the depth images, with the config's voxels and range or their
-    defaults; see `ReconstructConfig` for their unit."""
+    """Returns the grid that holds the depth images, by `ReconstructConfig`."""
     median = source.median(FAR if metric else np.inf)
     unit = 1.0 if metric else max(median, 1e-6) / _MEDIAN_DEPTH
     max_range = config.max_range * unit or max(_RANGE * unit, _RANGE_OF_MEDIAN * median)
@@ -121,8 +118,7 @@ def choose_grid(source: DepthSource, metric: bool, config: ReconstructConfig) ->
 
 
 def fuse(source: DepthSource, grid: FieldGrid, swept_radius: float = 0.0) -> Esdf:
-    """Fuses depth images into a distance field; space that no image saw is unknown, but for that
-    within `swept_radius` [m] of the path of the cameras."""
+    """Fuses depth images; unseen space is unknown except within `swept_radius` [m] of the path."""
     images = source.images()
     return esdf_from_depth_images(
         images, source.K, source.X_WCs, **vars(grid), swept_radius=swept_radius
@@ -132,8 +128,8 @@ def fuse(source: DepthSource, grid: FieldGrid, swept_radius: float = 0.0) -> Esd
 def make_distance_field(
     capture: Capture, frames: ShrunkFrames, gaussians: GaussianScene, config: ReconstructConfig
 ) -> tuple[Esdf, DepthSource]:
-    """Makes the distance field of a reconstruction from its fitted frames and Gaussians. Returns it
-    with the captured depth, or the rendered depth of a capture without any."""
+    """Makes the distance field of a reconstruction from its fitted frames and Gaussians; returns it
+    with the captured depth or, without any, the rendered depth."""
     captured = captured_depth(capture, range(len(capture)))
 
     def fuse_within(source: DepthSource, bounds: DepthSource) -> Esdf:

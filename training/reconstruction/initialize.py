@@ -93,9 +93,9 @@ class BlockMeans:
         """Covers the masked pixels with square cells as large as surface and texture allow.
 
         A quadtree splits cells of `max_size` pixels while depth is missing in them, less than a
-        `fraction` of them is masked, their surface is not flat, they extend on it for more than
-        `max_extent` times the depth, or their colors vary by a standard deviation above
-        `contrast`. Colors alone do not split a cell of 2 pixels; single pixels remain at edges.
+        `fraction` of them is masked, their surface is not flat or longer than `max_extent` times
+        the depth, or their colors, except in 2 x 2 pixels, vary by a standard deviation above
+        `contrast`. Single pixels remain at edges.
         """
         parts: list[tuple[NDArray, ...]] = []
         size = max_size
@@ -148,9 +148,8 @@ def frame_gaussians(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Returns centers p_WQ (n, 3) [m], covariances in W (n, 3, 3) [m^2] and colors (n, 3).
 
-    Narrow Gaussians keep texture sharp. The underlay, wide Gaussians of larger cells a little
-    behind, fills the gaps between them. Without it they are wider, for optimization to sharpen.
-    For the arguments, see `BlockMeans` and its `split`.
+    An underlay, wide Gaussians of larger cells a little behind, fills the gaps between narrow ones.
+    Without it they are wider, for optimization to sharpen. See `BlockMeans` for the arguments.
     """
     means = BlockMeans(frame, image, mask, 2 * max_size)
     surface = means.split(contrast, max_size, 0.75, max_extent)
@@ -163,12 +162,8 @@ def frame_gaussians(
     across = under.size * np.hypot(under.w_u, under.w_v) / under.w
     factor = 1 + _UNDERLAY_SETBACK + np.minimum(0.75 * across, _MAX_SETBACK)
     under = replace(under, w=under.w / factor, w_u=under.w_u / factor, w_v=under.w_v / factor)
-    return _concatenate(
-        [
-            (*cell_gaussians(frame, surface, _SPREAD), surface.color),
-            (*cell_gaussians(frame, under, _UNDERLAY_SPREAD), under.color),
-        ]
-    )
+    parts = (surface, _SPREAD), (under, _UNDERLAY_SPREAD)
+    return _concatenate((*cell_gaussians(frame, *part), part[0].color) for part in parts)
 
 
 def _concatenate(parts: Iterable[tuple[NDArray, NDArray, NDArray]]) -> tuple:
@@ -178,9 +173,9 @@ def _concatenate(parts: Iterable[tuple[NDArray, NDArray, NDArray]]) -> tuple:
 def cell_gaussians(
     frame: CaptureFrame, cells: Cells, spread: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the centers p_WQ (n, 3) [m] and covariances in W (n, 3, 3) [m^2] of flat Gaussians. A
-    cell's edges on the surface are t_u = s dP/du and t_v = s dP/dv, with P = r / w along the
-    pixel's ray r; `spread` times them are the standard deviations."""
+    """Returns the centers p_WQ (n, 3) [m] and covariances in W (n, 3, 3) [m^2] of flat Gaussians,
+    whose standard deviations are `spread` times the cell's edges on the surface, t_u = s dP/du and
+    t_v = s dP/dv, with P = r / w along the pixel's ray r."""
     f_u, f_v = frame.K[0, 0], frame.K[1, 1]
     z = 1 / cells.w
     P = frame.back_project(cells.u, cells.v, z)  # (n, 3)
@@ -201,8 +196,8 @@ def cell_gaussians(
 def principal_axes(
     covariances: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns quaternions wxyz (n, 4) and standard deviations (n, 3) of covariances (n, 3, 3). The
-    smallest comes last: the third axis of a flat Gaussian is its normal, as of surfels."""
+    """Returns quaternions wxyz (n, 4) and standard deviations (n, 3), the smallest last, of
+    covariances (n, 3, 3): the third axis of a flat Gaussian is its normal, as of surfels."""
     variances, R = np.linalg.eigh(covariances)
     variances, R = variances[:, ::-1], R[:, :, ::-1].copy()
     R[np.linalg.det(R) < 0, :, 0] *= -1
@@ -211,16 +206,11 @@ def principal_axes(
     return quats, np.sqrt(np.maximum(variances, smallest))
 
 
-def _available(capture: Capture) -> dict[str, bool]:
-    """Returns which initializations the capture has, the best first."""
-    return {"depth": capture.has_depth, "points": True, "random": True}
-
-
 def resolve_config(config: ReconstructConfig, capture: Capture) -> ReconstructConfig:
     """Returns the config with values for "auto" and -1 iterations."""
     kind, strategy, iterations = config.initialization, config.strategy, config.iterations
     if kind == "auto":
-        kind = next(name for name, exists in _available(capture).items() if exists)
+        kind = "depth" if capture.has_depth else "points"
     if strategy == "auto":
         strategy = "none" if kind == "depth" else "default"
     if iterations < 0:
@@ -252,10 +242,10 @@ def make_initial_gaussians(
     config: ReconstructConfig,
 ) -> GaussianScene:
     """Makes the Gaussians that `config` starts from; `extent` [m] is that of the cameras."""
-    kind, available = config.initialization, _available(capture)
-    possible = " or ".join(name for name, exists in available.items() if exists)
-    require(available[kind], "initialization", f"{possible} for {capture.name}", kind)
+    kind = config.initialization
     if kind == "depth":
+        condition = f"points or random for {capture.name}"
+        require(capture.has_depth, "initialization", condition, kind)
         count = min(config.initial_gaussians or config.max_gaussians, config.max_gaussians)
         return gaussians_from_depth(frames, photometry, count, config.contrast, optimized=True)
     if kind == "points":
@@ -283,13 +273,12 @@ def gaussians_from_depth(
     max_cell: int = 16,
     max_extent: float = 0.06,
 ) -> GaussianScene:
-    """Covers all surfaces of the frames with Gaussians, each surface once. Frames are loaded more
-    than once.
+    """Covers all surfaces of the frames, which are loaded repeatedly, with Gaussians, each once.
 
-    `contrast`, `max_cell` and `max_extent` are of the finest cells, see `BlockMeans.split`; they
+    `contrast`, `max_cell` and `max_extent` are of the finest cells, see `BlockMeans.split`; cells
     become coarser until the Gaussians fit: first by more contrast, then by size. If they will be
-    `optimized`, Gaussians are wider and without an underlay, and if even the coarsest are too many,
-    they are sampled; else more fill the gaps that the frames show between them.
+    `optimized`, Gaussians are wider, without an underlay and, if too many, sampled; else more fill
+    the gaps that the frames show between them.
     """
     views = [ThinnedFrame.of(frame) for frame in frames]
     if not any(view.depth.any() for view in views):
@@ -298,9 +287,8 @@ def gaussians_from_depth(
             "depth images and their unit, or set initialization=random"
         )
     # A gain approximates another tone curve, so other images are preferred to odd ones.
-    log_gains = np.log(photometry.gains)
-    odd = np.flatnonzero(np.abs(log_gains - np.log(np.median(photometry.gains))) > _MAX_ODDITY)
-    last = odd.tolist()
+    oddity = np.abs(np.log(photometry.gains) - np.log(np.median(photometry.gains)))
+    last = np.flatnonzero(oddity > _MAX_ODDITY).tolist()
     new = find_new_pixels(views, last)
     progress = Progress(desc="placing Gaussians", unit="frame")
     parts: dict[int, tuple[NDArray, NDArray, NDArray]] = {}
@@ -371,8 +359,7 @@ def _opaque_gaussians(p_WQ: NDArray, covariances: NDArray, colors: NDArray) -> G
 
 
 def _gaps(scene: BakedScene, frame: CaptureFrame, view: ThinnedFrame) -> ThinnedFrame:
-    """Returns the thinned frame with depth only at gaps of the scene, which shows nothing there, or
-    a surface behind the true one."""
+    """Returns the thinned frame with depth only where the scene shows nothing or what is behind."""
     height, width = frame.depth.shape
     depth = scene.render_depth(frame.K, width, height, frame.X_WC)
     surface = (frame.depth > 0) & (frame.depth < FAR)
@@ -383,8 +370,7 @@ def _gaps(scene: BakedScene, frame: CaptureFrame, view: ThinnedFrame) -> Thinned
 
 
 def gaussians_from_points(p_WQ: NDArray, colors: NDArray) -> GaussianScene:
-    """Returns round Gaussians at the points (N, 3) [m] with colors (N, 3), as large as the mean
-    distance to the three closest others."""
+    """Returns round Gaussians at the points (N, 3) [m] with colors (N, 3)."""
     if len(p_WQ) < 4:
         raise ValueError(f"{len(p_WQ)} points are too few to start from, at least 4 are required")
     distances, _ = KDTree(p_WQ).query(p_WQ, k=4)

@@ -67,11 +67,7 @@ def ssim_map(rendered: Tensor, target: Tensor) -> Tensor:
     )
 
 
-def log_depth_loss(
-    rendered: Tensor,
-    depth: Tensor,
-    weights: Tensor | None = None,
-) -> Tensor:
+def log_depth_loss(rendered: Tensor, depth: Tensor, weights: Tensor | None = None) -> Tensor:
     """Computes 1 / |V| sum over V of weight |log max(rendered, epsilon) - log depth|, where V =
     {pixels: epsilon < depth < far}, from 1 mm to 150 m; 0 if V is empty. Depths (...) are expected
     or accumulated, and true, in [m]; weights are 1 by default."""
@@ -81,7 +77,7 @@ def log_depth_loss(
     if _is_native(rendered):
         weights = None if weights is None else weights.ravel()
         truth = {"depth": depth.ravel(), "weights": weights, "epsilon": _EPSILON, "far": FAR}
-        truth |= {"simd": _simd()}
+        truth["simd"] = _simd()
         return _Native.apply(_native.log_depth_loss, truth, "rendered gradient", rendered.ravel())  # pyright: ignore[reportReturnType]
     valid = (depth > _EPSILON) & (depth < FAR)
     rendered, depth = rendered[valid], depth[valid]
@@ -96,10 +92,9 @@ def depth_edge_weights(depth: Tensor, jump: float = 0.1, far: float = FAR) -> Te
     """Returns weights for `log_depth_loss` that keep thin structures: 5 within 2 pixels of a
     discontinuity of the true depth (..., H, W) [m], 1 elsewhere.
 
-    The inverse depth of planes is linear in the pixel coordinates. So a pixel is at a discontinuity
-    if the second difference of inverse depth, along a row or a column, exceeds `jump` times the
-    largest of the three. Depth beyond `far` [m] counts as `far`, so that a branch before the sky
-    has edges; unknown depth (NaN, or at most 1 mm) makes none.
+    That is where the second difference of inverse depth, which is linear on planes, along a row or
+    a column, exceeds `jump` times the largest of the three. Depth beyond `far` [m] counts as `far`,
+    so that a branch before the sky has edges; unknown depth (NaN, or at most 1 mm) makes none.
     """
     inverse = torch.where(depth > _EPSILON, 1.0 / depth.clamp(max=far), torch.nan)
     edge = torch.zeros_like(depth, dtype=torch.bool)
@@ -130,9 +125,9 @@ def surface_loss(
     """Returns the mean of |log z - log depth| over a point, drawn by `rng`, from each Gaussian of
     `seen` (M,), for points within 5 % of the true depth (H, W) [m] at their pixel.
 
-    It moves centers to the surface, flattens Gaussians and aligns them with it, so that the median
-    depth is right, and does not act across edges. Means (N, 3) [m], quats (N, 4) and scales (N, 3)
-    [m] are those of all Gaussians, `viewmat` (4, 4) is world to camera.
+    It moves Gaussians to the surface, flattens and aligns them, so that the median depth is right.
+    Means (N, 3) [m], quats (N, 4) and scales (N, 3) [m] are of all Gaussians, `viewmat` (4, 4) is
+    world to camera.
     """
     draws = torch.from_numpy(rng.standard_normal((len(seen), 3), np.float32))
     if _is_native(means):

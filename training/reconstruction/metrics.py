@@ -24,8 +24,7 @@ _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _MIN_SIZE = 17  # [px] for the last pooling
 
 # SqueezeNet 1.1 (Iandola et al. 2016) without its classifier, with torchvision's names of weights.
-# Importing torchvision takes seconds and loads Triton, whose LLVM aborts the process if Mesa's
-# OpenGL has loaded another.
+# Torchvision loads Triton, whose LLVM aborts the process if Mesa's OpenGL has loaded another.
 
 
 class Fire(nn.Module):
@@ -64,13 +63,12 @@ _FILE = Path("weights", "lpips_squeeze.pt")
 
 class Lpips:
     """LPIPS v0.1 with the SqueezeNet 1.1 backbone (Zhang et al., "The Unreasonable Effectiveness
-    of Deep Features as a Perceptual Metric", CVPR 2018).
+    of Deep Features as a Perceptual Metric", CVPR 2018): the sum over layers of the mean over
+    pixels of w_l . (f_l(a) - f_l(b))^2, with features f_l of unit length.
 
-    With f_l the features of layer l, each pixel's scaled to unit length over channels, the distance
-    is the sum over layers of the mean over pixels of w_l . (f_l(a) - f_l(b))^2. Weights are
-    `{"squeezenet1_1": state dict, "lin": state dict}` in `lpips_squeeze.pt` of
-    `$SPLATPILOT_DATA/weights`. Without the file they are torchvision's downloaded backbone with the
-    linear layers of the installed package `lpips`.
+    Weights are `{"squeezenet1_1": state dict, "lin": state dict}` in `lpips_squeeze.pt` of
+    `$SPLATPILOT_DATA/weights`, or else torchvision's downloaded backbone with the linear layers of
+    the installed package `lpips`.
     """
 
     def __init__(self) -> None:
@@ -78,9 +76,8 @@ class Lpips:
         _load(self._source, torch.device("cpu"))
 
     def __call__(self, a: Tensor, b: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Returns the distance of two images (..., H, W, 3) float32, RGB in [0, 1], a scalar at
-        least 0, differentiable in `a`; that of several is their mean. `weights` (..., H, W) of the
-        pixels are averaged over each cell of a layer; equal by default, as published."""
+        """Returns the mean distance, differentiable in `a`, of images (..., H, W, 3) float32, RGB
+        in [0, 1]. `weights` (..., H, W) of pixels are equal by default, as published."""
         valid = a.shape == b.shape and a.ndim >= 3 and a.shape[-1] == 3
         require(
             valid and min(a.shape[-3:-1]) >= _MIN_SIZE,
@@ -92,21 +89,16 @@ class Lpips:
         features = _features(layers, a)
         with torch.no_grad():
             other_features = _features(layers, b)
-        distances = [
-            _weighted_mean(conv2d((x - y).square(), w), weights)
-            for x, y, w in zip(features, other_features, linear, strict=True)
-        ]
-        return torch.stack(distances).sum()
-
-
-def _weighted_mean(distances: Tensor, weights: Tensor | None) -> Tensor:
-    """Returns the mean of a layer's distances (N, 1, h, w), weighted by pixels (..., H, W)."""
-    if weights is None:
-        return distances.mean()
-    images = weights.reshape(-1, 1, *weights.shape[-2:])
-    height, width = distances.shape[-2:]
-    shares = adaptive_avg_pool2d(images, (height, width))
-    return (shares * distances).sum() / shares.sum()
+        means = []
+        for x, y, w in zip(features, other_features, linear, strict=True):
+            distances = conv2d((x - y).square(), w)  # (N, 1, h, w)
+            if weights is None:
+                means.append(distances.mean())
+                continue
+            images = weights.reshape(-1, 1, *weights.shape[-2:])
+            shares = adaptive_avg_pool2d(images, distances.shape[-2:])  # pyright: ignore
+            means.append((shares * distances).sum() / shares.sum())
+        return torch.stack(means).sum()
 
 
 def _features(layers: nn.Sequential, images: Tensor) -> list[Tensor]:
@@ -141,9 +133,9 @@ def _load(source: tuple[Path, ...], device: torch.device) -> tuple[nn.Sequential
     """Returns the layers of the backbone and the weights of the linear layers, (1, C, 1, 1)."""
     try:
         files = [torch.load(file, map_location="cpu", weights_only=True) for file in source]
-        backbone, linear = (
-            (files[0]["squeezenet1_1"], files[0]["lin"]) if len(files) == 1 else files
-        )
+        if len(files) == 1:
+            files = [files[0][name] for name in ("squeezenet1_1", "lin")]
+        backbone, linear = files
         layers = squeezenet_features()
         names = (name for name in backbone if name.startswith("features."))
         layers.load_state_dict({n.removeprefix("features."): backbone[n].float() for n in names})
@@ -161,11 +153,7 @@ def _load(source: tuple[Path, ...], device: torch.device) -> tuple[nn.Sequential
 
 _MIN_DEPTH = 1e-3  # [m], minimum true depth that counts, as in `log_depth_loss`
 _FLOATER_MARGIN = 0.1  # [m], and as a fraction of the true depth
-_SHOWN = {
-    "psnr_db": "{:.2f} dB",
-    "depth_mae_m": "{:.4f} m",
-    "hole_fraction": "{:.2%} holes",
-}
+_SHOWN = {"psnr_db": "{:.2f} dB", "depth_mae_m": "{:.4f} m", "hole_fraction": "{:.2%} holes"}
 
 
 @dataclass(frozen=True)
@@ -207,8 +195,7 @@ def mean_metric(views: Iterable[ViewMetrics], name: str) -> tuple[float | None, 
 
 
 def psnr_db(image: NDArray, truth: NDArray) -> float | None:
-    """Returns -10 log10 of the mean squared difference of images in [0, 1]; infinite if equal, None
-    without pixels."""
+    """Returns -10 log10 of the mean squared difference of images in [0, 1]; None without pixels."""
     if not np.size(truth):
         return None
     with np.errstate(divide="ignore"):
@@ -232,12 +219,9 @@ def has_true_depth(truth: NDArray) -> NDArray[np.bool_]:
 
 
 def depth_metrics(depth: NDArray, truth: NDArray) -> dict[str, float | None]:
-    """Compares the depth (H, W) [m] of cameras of unlimited range, 0 in a hole, with the truth.
-
-    Over pixels with true depth: the mean absolute error [m], which is the true depth in a hole; the
-    mean of |error| / true depth; the fraction of `floaters`; and the fraction of holes, which
-    policies take for free space. None without any.
-    """
+    """Compares depth (H, W) [m], 0 in a hole, with the truth, over pixels with true depth: the mean
+    absolute error [m], which is the true depth in a hole; the mean of |error| / true depth; and the
+    fractions of `floaters` and of holes, which policies take for free space. None without any."""
     known = has_true_depth(truth)
     error = np.abs(depth[known] - truth[known])
     metrics = {
@@ -254,11 +238,7 @@ def depth_metrics(depth: NDArray, truth: NDArray) -> dict[str, float | None]:
 
 def floaters(depth: NDArray, truth: NDArray) -> NDArray[np.bool_]:
     """Returns the pixels (H, W) that show a surface in front of the true one, an obstacle to a
-    policy: at a depth below D - max(0.1 m, D / 10), with the true depth D.
-
-    The relative margin is for edges, which may be off by pixels; the absolute one, because nothing
-    flies within 0.1 m of a surface.
-    """
+    policy: at a depth below D - max(0.1 m, D / 10), with the true depth D."""
     margin = _FLOATER_MARGIN * np.maximum(1, truth)
     with np.errstate(invalid="ignore"):
         in_front = depth < truth - margin
@@ -272,9 +252,8 @@ def fit_exposure(
     seen: NDArray[np.bool_],
     gain: float | None = None,
 ) -> tuple[NDArray, float]:
-    """Returns a rendered image (H, W, 3) with vignetting and exposure of the camera, and its gain.
-    Without a `gain`, it is the least-squares fit to the true image over the pixels `seen` (H, W),
-    because the exposure of a held-out frame does not depend on the scene."""
+    """Returns a rendered image (H, W, 3) with vignetting and exposure of the camera, and its gain,
+    by default the least-squares fit to the true image over the pixels `seen` (H, W)."""
     height, width = color.shape[:2]
     image = np.clip(color, 0, None) * vignette(vignetting, width, height)[..., None]
     if gain is None:
@@ -295,8 +274,7 @@ def measure_view(
     gain: float | None = None,
 ) -> ViewMetrics:
     """Compares a view that is rendered before black with the frame of its camera: colors after
-    `fit_exposure`, by default over all pixels, else over those `seen` (H, W). The windows of SSIM
-    and LPIPS reach over others."""
+    `fit_exposure`, over all pixels or those `seen` (H, W). Windows of SSIM and LPIPS reach on."""
     truth, sky = frame.image / 255, frame.depth >= FAR
     seen = frame.valid if seen is None else seen & frame.valid
     camera = truth, vignetting, seen, gain

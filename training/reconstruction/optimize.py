@@ -144,7 +144,7 @@ def view_loss(
     """Returns the loss of the rendering of view `k` before `background` (1, 3), in an image of this
     gain; `outlines` are fitted instead of colors. `perceptual` is LPIPS of two images (H, W, 3)."""
     device = config.device
-    frame = views.frame(k)
+    frame = views.frames[k]
     depth = torch.from_numpy(frame.depth).to(device)
     edges = views.edges[k].to(device).float()
     if outlines:
@@ -203,8 +203,8 @@ class Optimization:
         self._renderer = create_renderer(config.renderer_threads)
         self._seen = []
         if held_out is not None:
-            fitted = [ThinnedFrame.of(views.frame(k)) for k in range(len(views))]
-            self._seen = [seen_pixels(held_out.frame(k), fitted) for k in range(len(held_out))]
+            fitted = [ThinnedFrame.of(frame) for frame in views.frames]
+            self._seen = [seen_pixels(frame, fitted) for frame in held_out.frames]
         self._perceptual = perceptual
         center, extent = views.extent()
         # The distance of the cameras from each other says little about surfaces of known depth.
@@ -304,11 +304,13 @@ class Optimization:
         views = self._held_out
         if views is None:
             return None
-        found = []
-        for k, rendering in enumerate(self._renderings(views)):
-            scene = rendering.view(), self._background
-            found.append(measure_view(*scene, views.frame(k), views.vignetting, self._seen[k]))
-        return HeldOutMetrics(tuple(found))
+        each = zip(self._renderings(views), views.frames, self._seen, strict=True)
+        return HeldOutMetrics(
+            tuple(
+                measure_view(rendering.view(), self._background, frame, views.vignetting, seen)
+                for rendering, frame, seen in each
+            )
+        )
 
     def _limit_scales(self) -> None:
         bounded = self._config.initialization == "depth"
@@ -325,9 +327,8 @@ class Optimization:
         """Fits the gain of each image to the current scene; the mean of their logarithms is 0."""
         views = self._views
         gains = []
-        for k, rendering in enumerate(self._renderings(views)):
+        for frame, rendering in zip(views.frames, self._renderings(views), strict=True):
             color = rendering.color * views.vignette[..., None]
-            frame = views.frame(k)
             image = rendering.alpha[..., None] * torch.from_numpy(frame.image) / 255
             gains.append(fit_gain(color, image, torch.tensor(frame.valid)))
         log_gains = torch.log(torch.tensor(gains).clamp(min=0.1))

@@ -39,9 +39,9 @@ _FINAL_ON_SURFACE = 0.1
 
 
 def learning_rates(config: ReconstructConfig, length: float, progress: float) -> dict[str, float]:
-    """Returns the learning rate of each parameter of `SplatParameters`. Gaussians that start from
-    depth are on surfaces already: all parameters but their means move faster at first. `progress`
-    is the fraction of all steps, `length` [m] scales the rate of the means."""
+    """Returns the learning rate of each parameter of `SplatParameters`, given the fraction of all
+    steps; `length` [m] scales that of the means. All others are faster at first for Gaussians that
+    start from depth, which are on surfaces already."""
     rates = {"means": config.means_rate * length * _FINAL_MEANS**progress} | _RATES
     if config.initialization != "depth":
         return rates
@@ -105,10 +105,9 @@ def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> li
     """Returns the smallest and largest scales (N,) [m] of Gaussians at `means` (N, 3) [m].
 
     The smallest is the 3D smoothing filter of Mip-Splatting (Yu et al. 2024), 0.2 square pixels in
-    the closest view: depth images, which have no blur, and closer cameras would look through the
-    gaps between smaller Gaussians. The largest, if `bounded`, is a twentieth of the depth in the
-    closest view or, if no view sees the center, of the distance to the closest camera: large
-    Gaussians, each drawn by one affine approximation of perspective, would appear as haze or walls.
+    the closest view: depth images and closer cameras would look through the gaps between smaller
+    ones. The largest, if `bounded`, is a twentieth of the depth in the closest view or, if none
+    sees the center, of the distance to the closest camera: larger ones would appear as haze.
     """
     K, viewmats = views.K[0].to(means.device), views.viewmats.to(means.device)
     depth = torch.full_like(means[:, 0], torch.inf)  # [m] in the closest view that sees the center
@@ -120,7 +119,8 @@ def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> li
         u, v, _ = (p_CQ / z[:, None] @ K.T).unbind(dim=1)
         inside = (z > 0) & (u >= 0) & (u < views.width) & (v >= 0) & (v < views.height)
         index = inside.nonzero()[:, 0]
-        shown = views.depth(k)[v[index].long().cpu(), u[index].long().cpu()].to(means.device)
+        pixels = v[index].long().cpu(), u[index].long().cpu()
+        shown = torch.from_numpy(views.frames[k].depth)[pixels].to(means.device)
         index = index[(shown <= 0) | (z[index] < _HIDDEN * shown)]
         depth[index] = torch.minimum(depth[index], z[index])
     seen = depth.isfinite()

@@ -35,11 +35,6 @@ def vignette(vignetting: float, width: int, height: int) -> NDArray[np.float64]:
     return np.exp(vignetting * radius_squared(width, height))
 
 
-def thinning(width: int) -> int:
-    """Returns the stride of a thinned frame: it keeps one in so many pixels along each axis."""
-    return max(2, round(width / _THINNED_WIDTH))
-
-
 def widen(pixels: NDArray, stride: int, height: int, width: int) -> NDArray:
     """Returns pixels (h, w) of a thinned frame in the size (height, width) of the frame."""
     return pixels.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width]
@@ -49,7 +44,7 @@ def widen(pixels: NDArray, stride: int, height: int, width: int) -> NDArray:
 class ThinnedFrame:
     """A frame for comparison with others; (h, w) = (H, W) / `stride`."""
 
-    stride: int
+    stride: int  # one in so many pixels is kept along each axis
     X_WC: RigidTransform
     K: NDArray[np.float64]  # (3, 3) [px], of the whole frame
     depth: NDArray[np.floating]  # (h, w) [m]; 0 if unknown or sky
@@ -61,14 +56,13 @@ class ThinnedFrame:
     @classmethod
     def of(cls, frame: CaptureFrame) -> "ThinnedFrame":
         height, width = frame.depth.shape
-        stride = thinning(width)
+        stride = max(2, round(width / _THINNED_WIDTH))
         thin = (slice(None, None, stride), slice(None, None, stride))
         depth = np.where(frame.depth < FAR, frame.depth, 0).astype(np.float32)
         w = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
         w_v, w_u = (_smaller_difference(w, axis)[thin] for axis in (0, 1))
         depth = depth[thin]
-        # A plane is linear in inverse depth w: z changes by z^2 dw over one pixel, and the slope
-        # against the ray is about f z |dw|.
+        # A plane is linear in inverse depth w: z changes by z^2 dw over one pixel.
         slope = depth * np.hypot(w_u, w_v)  # relative change of depth per pixel
         f = frame.K[0, 0]
         return cls(
@@ -109,9 +103,7 @@ def find_overlaps(views: Sequence[ThinnedFrame]) -> list[list[int]]:
     them if it has any."""
     X_CWs = np.stack([view.X_WC.inverse().GetAsMatrix34() for view in views]).astype(np.float32)
     KX_CWs = np.stack([view.K for view in views]).astype(np.float32) @ X_CWs  # (n, 3, 4)
-    sizes = [
-        (view.stride * view.depth.shape[1], view.stride * view.depth.shape[0]) for view in views
-    ]
+    sizes = [np.multiply(view.stride, view.depth.shape[::-1]) for view in views]
     limit = np.array(sizes, np.float32)[..., None] + 1  # (n, 2, 1) [px], with a margin
     overlaps = []
     for view in views:
@@ -127,10 +119,9 @@ def find_overlaps(views: Sequence[ThinnedFrame]) -> list[list[int]]:
 def find_new_pixels(
     views: Sequence[ThinnedFrame], last: Collection[int] = (), smooth: bool = True
 ) -> list[NDArray[np.bool_]]:
-    """Finds, for each view, the pixels (h, w) to keep so that every point is kept about once. Keeps
-    pixels that are nearly the finest of their point, in the first view that has them. Views are
-    visited from the closest to the farthest, those with an index in `last` after the others.
-    `smooth` removes speckle."""
+    """Finds, for each view, the pixels (h, w) that keep every point about once: nearly the finest
+    of their point, in the first view that has them, from the closest to the farthest view, those
+    with an index in `last` after the others. `smooth` removes speckle."""
     overlapping = find_overlaps(views)
     fine = []  # pixels that are nearly the finest
     for i, view in enumerate(Progress(views, "comparing frames", unit="frame")):
@@ -201,12 +192,9 @@ class Photometry:
 
 
 def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
-    """Estimates gains and vignetting from points that at least two views show.
-
-    Each gives an equation, log I_i - log I_j = g_i - g_j + a (rho_i^2 - rho_j^2), for the log gains
-    g and the vignetting a. Iteratively reweighted least squares minimize the sum of absolute
-    residuals, for shiny surfaces give outliers; damping makes free variables 0.
-    """
+    """Estimates log gains g and vignetting a from points that at least two views show,
+    log I_i - log I_j = g_i - g_j + a (rho_i^2 - rho_j^2), by iteratively reweighted least squares:
+    shiny surfaces give outliers. Damping makes free variables 0."""
     rng = np.random.default_rng(seed)
     n = len(views)
     samples = []
@@ -250,12 +238,8 @@ def predict_gains(
     fitted: Sequence[int], gains: NDArray[np.float64], others: Sequence[int]
 ) -> NDArray[np.float64]:
     """Predicts the gains of the frames `others` (m,) from those of the `fitted` frames (n,), both
-    numbered in order of time.
-
-    Interpolates logarithms between neighbors and shrinks them by the factor, from 0 to 1, that
-    predicts fitted gains best from their own neighbors. So it follows the exposure of a video, and
-    is 1 for photographs in any order.
-    """
+    numbered in order of time: interpolated logarithms, shrunk by the factor from 0 to 1 that
+    predicts fitted gains best from their neighbors, about 0 for photographs in any order."""
     numbers, log_gains = np.asarray(fitted, float), np.log(gains)
     middle = numbers[1:-1]
     share = (middle - numbers[:-2]) / np.maximum(numbers[2:] - numbers[:-2], 1)

@@ -15,14 +15,13 @@ from splatpilot.diagrams.worlds.observed_routes import (
     with_views,
 )
 from splatpilot.diagrams.worlds.scene_folder import (
+    SceneMetadata,
     check_scene_target,
     close_frontier,
     write_scene_folder,
 )
 from splatpilot.diagrams.worlds.splits import choose_split, part_digests, source_digest
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.observations import Observations
 from splatpilot.systems.common.processes import one_torch_thread
 from splatpilot.systems.common.progress import Progress
@@ -33,7 +32,7 @@ from splatpilot.training.captures.capture import Capture, shrink_factor
 from splatpilot.training.captures.render import RECIPE, rendered_world
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.distance_field import DepthSource, make_distance_field
+from splatpilot.training.reconstruction.distance_field import make_distance_field
 from splatpilot.training.reconstruction.initialize import (
     gaussians_from_depth,
     held_out_frames,
@@ -62,35 +61,33 @@ class ReconstructSummary:
     """A reconstructed scene."""
 
     scene: Path
-    frames: int
+    metadata: SceneMetadata
     gaussians: int
-    vignetting: float
-    gain_range: tuple[float, float]
-    metric: bool  # lengths are in meters
-    field: Esdf
+    voxel_size: float
     route: ObservedRoute  # default start and goal; of length NaN if the scene cannot be flown in
-    held_out: HeldOutMetrics | None = None
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    held_out: HeldOutMetrics | None
+    warnings: tuple[str, ...]
 
     def __str__(self) -> str:
         def vector(p: NDArray) -> str:
             return "(" + ", ".join(f"{x:.2f}" for x in p) + ")"
 
-        unit = "m" if self.metric else "units of an unknown length"
-        lower_W, upper_W = self.field.lower_W, self.field.upper_W
+        about = self.metadata
+        unit = "m" if about.metric else "units of an unknown length"
+        lower_W, upper_W = np.array(about.lower_W), np.array(about.upper_W)
         size = " x ".join(f"{length:.3g}" for length in upper_W - lower_W)
+        gains = np.delete(about.gains, about.held_out)
         rows = {
             "scene": self.scene,
-            "frames": self.frames,
+            "frames": len(about.gains),
             "Gaussians": self.gaussians,
             "size": f"{size} {unit}, from {vector(lower_W)} to {vector(upper_W)}",
-            "distance field": f"voxels of {self.field.voxel_size:.2g} {unit}",
-            "image gains": f"{self.gain_range[0]:.3f} to {self.gain_range[1]:.3f}",
-            "corner brightness": f"{np.exp(self.vignetting):.3f}",
+            "distance field": f"voxels of {self.voxel_size:.2g} {unit}",
+            "image gains": f"{gains.min():.3f} to {gains.max():.3f}",
+            "corner brightness": f"{np.exp(about.vignetting):.3f}",
         }
-        if self.metric:
-            rows["seen free [m^3]"] = f"{self.field.volume(FieldState.FREE):.1f}"
+        if about.metric:
+            rows["seen free [m^3]"] = f"{about.observed_free_volume:.1f}"
         if np.isfinite(self.route.length):
             rows |= {
                 "default start [m]": vector(self.route.p_WS),
@@ -101,7 +98,7 @@ class ReconstructSummary:
         if self.held_out is not None:
             rows["held-out frames"] = self.held_out
         lines = [f"{name:<18} {value}" for name, value in rows.items()]
-        lines += [f"note: {note}" for note in self.notes]
+        lines += [f"note: {note}" for note in about.capture_notes]
         return "\n".join(lines + [f"warning: {warning}" for warning in self.warnings])
 
 
@@ -109,9 +106,8 @@ class ReconstructSummary:
 def reconstruct(
     capture: Capture, out: str | Path, config: ReconstructConfig, *, restart: bool = False
 ) -> ReconstructSummary:
-    """Reconstructs a capture as the scene folder `out`. Checkpoints are in the folder
-    `.NAME.partial` next to `out`; after an interruption, the same call resumes and ends in the
-    bitwise identical scene. With `restart` it starts again."""
+    """Reconstructs a capture as the scene folder `out`. Checkpoints are in `.NAME.partial` next to
+    it, from which, unless `restart`, the same call resumes to the bitwise identical scene."""
     out = Path(out)
     config.validate()
     check_scene_target(out)
@@ -164,7 +160,11 @@ def reconstruct(
         how = f"{config.representation}, {config.iterations} steps"
 
     field, depth = make_distance_field(capture, frames, gaussians, config)
-    observations = observe(depth, field.voxel_size)
+    images = depth.images("counting observations")
+    # In voxels twice as large as those of the field.
+    observations = Observations.from_depth_images(
+        images, depth.K, depth.X_WCs, 2.0 * field.voxel_size
+    )
     frontier = None
     if capture.metric:
         images = depth.images("finding unobserved space")
@@ -174,12 +174,12 @@ def reconstruct(
         capture.name, gaussians, field, field, background, *ends, observations=observations
     )
     world, route, warnings = with_default_route(world, frontier, capture.metric)
-    write_scene_folder(
+    metadata = write_scene_folder(
         out,
         world,
         frontier,
         provenance=f"{capture.source}, {len(capture)} frames, {how}",
-        gains=[float(gain) for gain in gains],
+        gains=gains,
         vignetting=photometry.vignetting,
         metric=capture.metric,
         representation=config.representation if config.iterations else "3dgs",
@@ -194,19 +194,9 @@ def reconstruct(
     )
     if checkpoint is not None:
         checkpoint.remove()
-    return ReconstructSummary(
-        scene=out,
-        frames=len(capture),
-        gaussians=len(gaussians),
-        vignetting=photometry.vignetting,
-        gain_range=(float(gains[fitted].min()), float(gains[fitted].max())),
-        metric=capture.metric,
-        field=field,
-        route=route,
-        held_out=metrics,
-        notes=tuple(capture.notes),
-        warnings=(*capture.dropped, *without_depth, *warnings),
-    )
+    warnings = (*capture.dropped, *without_depth, *warnings)
+    voxel_size = field.voxel_size
+    return ReconstructSummary(out, metadata, len(gaussians), voxel_size, route, metrics, warnings)
 
 
 def _digested(capture: Capture, digests: set[str]) -> Capture:
@@ -221,8 +211,8 @@ def _digested(capture: Capture, digests: set[str]) -> Capture:
 
 
 def _source_and_split(capture: Capture, images: set[str], split: str) -> tuple[list[str], str]:
-    """Returns the source digest of a scene and its split: those of the world that the capture was
-    rendered of, or else of its fitted `images`, by digest. `split` is the user's, or empty."""
+    """Returns the source digest of a scene and its split: of the world that was rendered, or else
+    of the fitted `images`, by digest. `split` is the user's, or empty."""
     name = capture.folder or capture.name
     folder, rendered = Path(capture.folder), None
     if capture.folder:  # a rendered capture may hold others
@@ -247,17 +237,11 @@ def _without_depth(
     return (f"{len(empty)} of {len(frames)} frames have no pixel with depth: {listed}",)
 
 
-def observe(depth: DepthSource, voxel_size: float) -> Observations:
-    """Counts the observations of surfaces, in voxels twice as large as those of the field."""
-    images = depth.images("counting observations")
-    return Observations.from_depth_images(images, depth.K, depth.X_WCs, 2.0 * voxel_size)
-
-
 def with_default_route(
     world: World, frontier: GaussianScene | None, metric: bool
 ) -> tuple[World, ObservedRoute, tuple[str, ...]]:
     """Returns the world with its table of views and its default start and goal, this route, and
-    warnings. The ends remain if the scene cannot be flown in."""
+    warnings; the world as it is if it cannot be flown in."""
     route = ObservedRoute(world.p_WS, world.p_WG, float("nan"), float("nan"))
     if not metric:
         return world, route, ("this scene cannot be flown in: its scale is unknown",)

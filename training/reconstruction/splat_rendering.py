@@ -47,12 +47,9 @@ def render(
     renderer: Renderer | None = None,
 ) -> Rendering:
     """Renders color and depth of one camera, see `rasterize` for the arguments; `gaussians` are
-    means, quats, scales, opacities and spherical harmonics.
-
-    `depth_mode` is "D", accumulated, "ED", expected, or "MD", median, which has no gradient and is
-    0 without a surface. `eps2d` blurs Gaussians, not surfels; `distortion` renders that of surfels
-    along their rays.
-    """
+    means, quats, scales, opacities and spherical harmonics. `depth_mode` is "D", accumulated, "ED",
+    expected, or "MD", median, which has no gradient and is 0 without a surface. `eps2d` blurs
+    Gaussians, not surfels; `distortion` renders that of surfels along their rays."""
     scene = *gaussians, viewmat, K, width, height
     options: dict[str, Any] = {
         "sh_degree": harmonic_degree(gaussians[4].shape[1]),

@@ -29,12 +29,8 @@ _SPARSE = 4  # one in so many pixels along each axis gives the mean color and th
 _HEIGHT, _WIDTH = 128, 256  # texels of the background, powers of two
 
 
-def _depth_codes() -> NDArray[np.float32]:
-    depths = np.geomspace(_MIN_DEPTH, FAR, _CODES).astype(np.float32)
-    return np.concatenate([np.zeros(1, np.float32), depths[:-1], np.full(1, np.inf, np.float32)])
-
-
-_DEPTHS = _depth_codes()
+_DEPTHS = np.geomspace(_MIN_DEPTH, FAR, _CODES).astype(np.float32)
+_DEPTHS = np.concatenate([np.float32([0]), _DEPTHS[:-1], np.float32([np.inf])])
 
 
 class ShrunkFrames(Sequence[CaptureFrame]):
@@ -53,9 +49,8 @@ class ShrunkFrames(Sequence[CaptureFrame]):
         if k not in self._kept:
             frame = shrink(self._capture.frame(self.numbers[k]), self.factor)
             known = np.where(frame.depth > 0, frame.depth, FAR).clip(_MIN_DEPTH, FAR)
-            codes = (
-                np.rint(np.log(known / _MIN_DEPTH) / np.log(FAR / _MIN_DEPTH) * (_CODES - 1)) + 1
-            )
+            share = np.log(known / _MIN_DEPTH) / np.log(FAR / _MIN_DEPTH)
+            codes = np.rint(share * (_CODES - 1)) + 1
             codes = np.where(frame.depth > 0, codes, 0).astype(np.uint16)
             valid = np.ones((1, 1), bool) if frame.valid.all() else frame.valid
             nothing = np.broadcast_to(np.float32(0), codes.shape)
@@ -68,7 +63,7 @@ class ReconstructionViews:
     """Frames of one size and K, with their photometry, for tensors on the CPU."""
 
     def __init__(self, frames: Sequence[CaptureFrame], photometry: Photometry):
-        self._frames = frames
+        self.frames = frames
         edges, viewmats, outlines, depths = [], [], [], []
         for frame in Progress(frames, "loading frames", len(frames), unit="frame"):
             depth = torch.from_numpy(frame.depth)
@@ -93,14 +88,14 @@ class ReconstructionViews:
         self.vignette = torch.from_numpy(vignette).float()  # (H, W)
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self.frames)
 
     def digest(self) -> str:
         """Returns a digest of images, depths and cameras."""
         digest = hashlib.sha256()
         for tensor in (self.viewmats, self.K, self.gains):
             digest.update(tensor.numpy().tobytes())
-        for frame in self._frames:
+        for frame in self.frames:
             for array in (frame.image, frame.depth, frame.valid):
                 digest.update(array.tobytes())
         return digest.hexdigest()
@@ -118,14 +113,6 @@ class ReconstructionViews:
         extent = 1.1 * float(np.linalg.norm(p_WCs - center, axis=1).max())
         return center, extent if extent > 1e-6 else 1.0
 
-    def frame(self, k: int) -> CaptureFrame:
-        """Returns a frame as given."""
-        return self._frames[k]
-
-    def depth(self, k: int) -> Tensor:
-        """Returns the depth (H, W) [m] of view k."""
-        return torch.from_numpy(self._frames[k].depth)
-
     def target(self, frame: CaptureFrame, gain: Tensor, background: Tensor) -> Tensor:
         """Returns the image (H, W, 3) of a frame without gain and vignetting, about 0 to 1, with
         `background` (3,) in the sky."""
@@ -136,9 +123,8 @@ class ReconstructionViews:
 
 
 def learn_background(frames: Sequence[CaptureFrame], photometry: Photometry) -> Background:
-    """Learns the sky of the frames in every direction. Each texel has the mean color, without gains
-    and vignetting, of the pixels that look into it, or else is interpolated. Without any sky, it is
-    the mean color of the frames, the best guess for what none of them shows."""
+    """Learns the sky: each texel has the mean color, without gains and vignetting, of the pixels
+    that look into it, or is interpolated. Without any sky, returns the mean color of the frames."""
     mean = np.zeros(3)
     sums, counts = np.zeros((_HEIGHT * _WIDTH, 3)), np.zeros(_HEIGHT * _WIDTH)
     for k, frame in enumerate(frames):
