@@ -87,11 +87,7 @@ def _speed(text: str) -> float:
         _names,
         resolve=_speed,
     ),
-    cli.Option(
-        "--seeds N",
-        "flights of each policy, scenario and speed; default: 20",
-        int,
-    ),
+    cli.Option("--seeds N", "flights of each policy, scenario and speed; default: 20", int),
     cli.Option("--split", "seeds to fly: dev (default) for development, test for final results"),
     cli.JOBS,
     cli.Option("--cluster ADDRESS", "fly on the workers of this dask scheduler"),
@@ -121,9 +117,8 @@ def benchmark(options: argparse.Namespace) -> Any:
         fields |= QUICK
     if options.dodgedrone:
         fields |= {"scenarios": list(PUBLISHED), "speeds": list(DODGEDRONE_SPEEDS)}
-    for name in ("scenarios", "seeds", "split", "speeds"):
-        if getattr(options, name) is not None:
-            fields[name] = getattr(options, name)
+    named = {name: getattr(options, name) for name in ("scenarios", "seeds", "split", "speeds")}
+    fields |= {name: value for name, value in named.items() if value is not None}
     swept = [values for text in options.sweep if (values := scenario_sweep(text))]
     policies = [each for text in options.sweep if not scenario_sweep(text) for each in sweep(text)]
     if options.policies is not None or policies:

@@ -62,11 +62,9 @@ def reconstruct(options: argparse.Namespace) -> None:
     if not rendered:
         cli.call(measure_scene.make_scene, options, capture=Path(source), config=config)
         return
-    if options.up is not None:
-        config.render.up = options.up
-    seed = options.seed or 0
-    make, world = measure_scene.make_rendered_scene, Path(source)
-    cli.call(make, options, world=world, config=config, seed=seed)
+    config.render.up = options.up or config.render.up
+    given = {"world": Path(source), "config": config, "seed": options.seed or 0}
+    cli.call(measure_scene.make_rendered_scene, options, **given)
 
 
 @cli.command(
@@ -138,9 +136,7 @@ _OUT = cli.out_option("folder of scenes (default: $SPLATPILOT_SCENES, or scenes)
         "names", "hospital, cafe, ... (default: all whose sources exist)", nargs="*", metavar="NAME"
     ),
     cli.Option("--data", "folder of captures, meshes and maps (default: $SPLATPILOT_DATA)", Path),
-    cli.Option(
-        "--split", "only environments of this split", choices=("train", "validation", "test")
-    ),
+    cli.Option("--split", "only this split", choices=("train", "validation", "test"), default=""),
     _OUT,
     cli.set_option(
         *("iterations=3000", "render.max_frames=100"),
@@ -161,8 +157,7 @@ def make(options: argparse.Namespace) -> Any:
     from splatpilot.systems.common.progress import resumable
 
     with resumable(lambda: f"finished scenes are in {scenes}; the same command resumes"):
-        split = options.split or ""
-        return cli.call(environments.make, options, data=data, scenes=scenes, split=split)
+        return cli.call(environments.make, options, data=data, scenes=scenes)
 
 
 @cli.command("library show", _OUT, cli.json_option("the records"), examples=("library show",))

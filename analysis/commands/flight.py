@@ -11,10 +11,6 @@ from splatpilot.analysis.commands.checks import SCENARIOS
 from splatpilot.diagrams.scenarios import scenario_file
 
 
-def _names(text: str) -> list[str]:
-    return text.split(",")
-
-
 @cli.command(
     "fly",
     *cli.SCENARIO_OPTIONS,
@@ -27,7 +23,7 @@ def _names(text: str) -> list[str]:
         "--draw NAMES",
         "with --live, draw some of velocity,thrust,rates,waypoint,nearest,barrier,axes,depth,"
         "frustum,limits",
-        _names,
+        lambda text: text.split(","),
         default=[],
     ),
     cli.flag("--no-video", "do not write flight.mp4"),
@@ -68,9 +64,8 @@ def _scenario_defaults(options: argparse.Namespace) -> Any:
     from splatpilot.diagrams.flight.scenario import Scenario
     from splatpilot.systems.common.config import load_config
 
-    return load_config(
-        Scenario(), scenario_file(options.what) if options.what in SCENARIOS else None
-    )
+    file = scenario_file(options.what) if options.what in SCENARIOS else None
+    return load_config(Scenario(), file)
 
 
 WORLD_FIELDS = cli.set_option(

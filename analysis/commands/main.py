@@ -192,7 +192,8 @@ def main(arguments: list[str] | None = None) -> int:
     except OverflowError as error:
         return _report(f"a number given to {name} is too large ({error}); give a smaller one", 1)
     except KeyboardInterrupt as interruption:
-        message, status = _SIGNALS[getattr(interruption, "number", signal.SIGINT)]
+        terminated = signal.SIGTERM in interruption.args
+        message, status = _SIGNALS[signal.SIGTERM if terminated else signal.SIGINT]
         notes = getattr(interruption, "__notes__", ())
         return _report("; ".join([message, *notes]), status)
     except Exception as error:
@@ -252,15 +253,9 @@ def _is_warning(record: logging.LogRecord) -> bool:
     return record.levelno >= logging.WARNING
 
 
-class _SignalError(KeyboardInterrupt):
-    def __init__(self, number: int):
-        super().__init__(number)
-        self.number = signal.Signals(number)
-
-
 @contextlib.contextmanager
 def _interrupted_by_signals() -> Iterator[None]:
-    """Lets SIGTERM and Ctrl-C raise `_SignalError` in the block, if this is the main thread."""
+    """Lets SIGTERM and Ctrl-C raise KeyboardInterrupt in the block, if this is the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -268,7 +263,7 @@ def _interrupted_by_signals() -> Iterator[None]:
     def interrupt(number: int, frame: FrameType | None) -> None:
         if _is_importing(frame):
             _exit_at_once(number, frame)
-        raise _SignalError(number)
+        raise KeyboardInterrupt(signal.Signals(number))
 
     before = {number: signal.signal(number, interrupt) for number in _heeded_signals()}
     try:

@@ -4,11 +4,11 @@ import argparse
 import dataclasses
 import inspect
 import math
+import pkgutil
 import shutil
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,9 +67,7 @@ class Command:
         """Adds description, examples and options to the parser of the command."""
         width = max(shutil.get_terminal_size().columns - 2, 40)
         parser.description = textwrap.fill(inspect.getdoc(self.function) or "", width)
-        parser.epilog = "\n".join(
-            ["examples:", *(f"  splatpilot {line}" for line in self.examples)]
-        )
+        parser.epilog = "\n  splatpilot ".join(["examples:", *self.examples])
         parser.formatter_class = argparse.RawDescriptionHelpFormatter
         exclusive = any(each.exclusive for each in self.options)
         group = parser.add_mutually_exclusive_group() if exclusive else parser
@@ -90,8 +88,8 @@ class Command:
                 require_unused(value, options.overwrite)
             if each.resolve is not None and value is not None:
                 several = isinstance(value, list)
-                resolved = [each.resolve(one) for one in (value if several else [value])]
-                setattr(options, each.name, resolved if several else resolved[0])
+                resolved = [*map(each.resolve, value)] if several else each.resolve(value)
+                setattr(options, each.name, resolved)
         return self.function(options)
 
 
@@ -147,11 +145,7 @@ class SetField(argparse.Action):
         self.configuration = configuration
 
     def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: Any,
-        option_string: str | None = None,
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, *_: Any
     ) -> None:
         if values == "help":
             from splatpilot.systems.common.config import format_fields  # imports Drake
@@ -168,8 +162,7 @@ def set_option(*examples: str, configuration: str | Callable[[argparse.Namespace
     function that makes it from the options before `--set`."""
 
     def make_default(options: argparse.Namespace) -> Any:
-        module, _, name = str(configuration).partition(":")
-        return getattr(import_module(module), name)()
+        return pkgutil.resolve_name(str(configuration))()
 
     return Option(
         "--set FIELD=VALUE",
