@@ -16,7 +16,7 @@ from splatpilot.systems.common.readers import error_summary
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
-_VERSION = 3
+_VERSION = 4
 _REMEDY = "start again with --restart, or delete that file"
 # Fields that may differ when a run resumes: they do not change the optimization.
 _UNCOMPARED = {"threads", "checkpoint_every", "tensorboard", "split"}

@@ -9,13 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.optim.adam import adam
 
 from splatpilot import _native
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
-_EPSILON = 1e-15  # of Adam, as published, for gradients of single Gaussians are tiny
+# As published: epsilon is small, for gradients of single Gaussians are tiny.
+_ADAM: dict[str, Any] = {"fused": True, "amsgrad": False, "maximize": False, "weight_decay": 0.0}
+_ADAM |= {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15}
 _OPACITIES = (1e-4, 1 - 1e-4)  # 0 and 1 have infinite logits
 _INVISIBLE = 1 / 255  # opacity that adds to no pixel
 _FLAT = 1e-6  # [m], standard deviation of a surfel along its normal
@@ -143,16 +146,16 @@ class SplatParameters:
     def __init__(
         self,
         tensors: Mapping[str, Tensor],
-        optimizer: dict[str, Any] | None = None,
+        averages: dict[str, list[Tensor]] | None = None,
         limits: Sequence[Tensor] | None = None,
     ):
-        groups = [
-            {"name": name, "params": [tensor.detach().clone().requires_grad_()]}
-            for name, tensor in tensors.items()
-        ]
-        self._adam = torch.optim.Adam(groups, eps=_EPSILON, fused=True)
-        if optimizer is not None:
-            self._adam.load_state_dict(optimizer)
+        self._tensors = {n: t.detach().clone().requires_grad_() for n, t in tensors.items()}
+        # Of each tensor the averages of the gradient and its square, and the number of steps. The
+        # class `torch.optim.Adam` would take seconds to import torch's compiler.
+        self._averages = averages or {
+            name: [torch.zeros_like(t), torch.zeros_like(t), torch.zeros((), device=t.device)]
+            for name, t in tensors.items()
+        }
         self.limit_scales(limits or _no_limits(tensors["logit_opacities"]))
 
     @classmethod
@@ -174,23 +177,19 @@ class SplatParameters:
         return cls(tensors | {"logit_opacities": torch.logit(tensors["logit_opacities"])})
 
     def __getitem__(self, name: str) -> Tensor:
-        return self._groups[name]["params"][0]
+        return self._tensors[name]
 
     def __len__(self) -> int:
         return len(self["means"])
 
     @property
-    def _groups(self) -> dict[str, dict[str, Any]]:
-        return {group["name"]: group for group in self._adam.param_groups}
-
-    @property
     def names(self) -> list[str]:
-        return list(self._groups)
+        return list(self._tensors)
 
     @property
     def sh(self) -> Tensor:
         """(N, K, 3)."""
-        if "sh_rest" not in self._groups:
+        if "sh_rest" not in self._tensors:
             return self["sh_0"]
         return torch.cat([self["sh_0"], self["sh_rest"]], dim=1)
 
@@ -215,28 +214,26 @@ class SplatParameters:
         self._max_log_scales = torch.log(limits[1])[:, None]
         self._clamp_scales()
 
+    @torch.no_grad()
     def step(self, rates: Mapping[str, float]) -> None:
         """Takes a step of Adam with these learning rates, and clears the gradients."""
-        for name, group in self._groups.items():
-            group["lr"] = rates[name]
-        self._adam.step()
-        self._adam.zero_grad()
+        for name, tensor in self._tensors.items():
+            if tensor.grad is not None:
+                state = [[each] for each in (tensor, tensor.grad, *self._averages[name])]
+                adam(*state[:4], [], state[4], lr=rates[name], **_ADAM)
+                tensor.grad = None
         self._clamp_scales()
 
     @torch.no_grad()
     def rebuild(self, rows: Tensor, added: Mapping[str, Tensor] | None = None) -> None:
         """Keeps the Gaussians `rows` (indices), in that order, and appends those `added`, with
         averages of 0 in Adam and without limits."""
-        for name, group in self._groups.items():
-            old = group["params"][0]
+        for name, old in self._tensors.items():
             extra = old[:0] if added is None else added[name]
-            new = torch.cat([old[rows], extra]).requires_grad_()
-            group["params"][0] = new
-            state = self._adam.state.pop(old, {})
-            for average in ("exp_avg", "exp_avg_sq"):
-                if average in state:
-                    state[average] = torch.cat([state[average][rows], torch.zeros_like(extra)])
-            self._adam.state[new] = state
+            self._tensors[name] = torch.cat([old[rows], extra]).requires_grad_()
+            for k in range(2):
+                average = self._averages[name][k][rows]
+                self._averages[name][k] = torch.cat([average, torch.zeros_like(extra)])
         limits = zip(self._limits, _no_limits(self["logit_opacities"][len(rows) :]), strict=True)
         self.limit_scales([torch.cat([old[rows], new]) for old, new in limits])
 
@@ -244,15 +241,14 @@ class SplatParameters:
     def overwrite(self, name: str, values: Tensor) -> None:
         """Sets a parameter (N, ...), and its averages in Adam to 0."""
         self[name].copy_(values)
-        for average in ("exp_avg", "exp_avg_sq"):
-            if average in self._adam.state[self[name]]:
-                self._adam.state[self[name]][average].zero_()
+        for average in self._averages[name][:2]:
+            average.zero_()
 
     def state(self) -> dict[str, Any]:
         """Returns the arguments of `__init__` that restore these parameters; they are shared."""
         return {
             "tensors": {name: self[name].detach() for name in self.names},
-            "optimizer": self._adam.state_dict(),
+            "averages": self._averages,
             "limits": list(self._limits),
         }
 
