@@ -64,7 +64,6 @@ def test_suffixes_tell_scenes_from_maps(tmp_path):
 
 
 def test_octomap_is_seen_where_it_is_occupied():
-
     occupied = np.zeros((12, 12, 12), bool)
     occupied[4:8, 4:8, :] = True
     esdf = esdf_from_occupancy(occupied, np.zeros_like(occupied), np.zeros(3), 0.5)

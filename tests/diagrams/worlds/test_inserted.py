@@ -36,11 +36,15 @@ def test_scenes_are_found_by_name(hall, monkeypatch, tmp_path):
         make_world(SceneConfig(path="hall", source="ask Ann"), 0)
 
 
-def test_shipped_scene_can_be_flown_in():
-    world = make_world(SceneConfig(path="small_house"), 0)
-    assert len(world.gaussians) > 300_000 and world.num_frontier > 0
-    ends = np.stack([world.p_WS, world.p_WG])
-    assert (world.esdf.conservative().distance(ends) > VEHICLE_RADIUS).all()
+@pytest.fixture(scope="module")
+def house() -> World:
+    return make_world(SceneConfig(path="small_house"), 0)
+
+
+def test_shipped_scene_can_be_flown_in(house):
+    assert len(house.gaussians) > 300_000 and house.num_frontier > 0
+    ends = np.stack([house.p_WS, house.p_WG])
+    assert (house.esdf.conservative().distance(ends) > VEHICLE_RADIUS).all()
 
 
 def test_starts_and_goals_are_drawn_from_the_seed(hall, monkeypatch):
@@ -66,17 +70,14 @@ def test_inserted_solids_are_seen_hit_and_leave_gaps(hall, monkeypatch):
     assert changed.any() and (world.esdf.distances <= before.esdf.distances + 1e-6).all()
     ends = np.stack([world.p_WS, world.p_WG])
     assert world.esdf.distance(ends).min() > 0.8
-    field = world.esdf.conservative()
-    assert connects(field, *ends, GAP / 2 - 0.05, 0.1)
+    assert connects(world.esdf.conservative(), *ends, GAP / 2 - 0.05, 0.1)
     again = make_world(InsertedConfig(path="hall"), 0)
     np.testing.assert_array_equal(world.gaussians.means, again.gaussians.means)
 
 
-def test_inserted_solids_count_as_observed():
-    scene = make_world(SceneConfig(path="small_house"), 0)
+def test_inserted_solids_count_as_observed(house):
     world = make_world(InsertedConfig(path="small_house"), 0)
-    assert scene.observations is not None and world.observations is not None
-    assert len(world.observations.voxels) > len(scene.observations.voxels)
-    added = world.gaussians.means[: len(world.gaussians) - len(scene.gaussians)].astype(float)
+    assert len(world.observations.voxels) > len(house.observations.voxels)
+    added = world.gaussians.means[: len(world.gaussians) - len(house.gaussians)].astype(float)
     above = added.mean(axis=0) + np.array([0.0, 0.0, 5.0])
     assert world.observations.agree_with(added, above).mean() > 0.98

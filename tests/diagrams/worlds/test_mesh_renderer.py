@@ -30,20 +30,27 @@ def square(x: float, half: float, back: bool = False):
     return p, uv, triangles[:, ::-1] if back else triangles
 
 
-def png(alpha: np.ndarray, color=(255, 255, 255)) -> str:
-    pixels = np.dstack([np.full((*alpha.shape, 3), color, np.uint8), alpha.astype(np.uint8)])
+def encoded(image: Image.Image, kind: str = "PNG") -> str:
     stream = BytesIO()
-    Image.fromarray(pixels).save(stream, "PNG")
-    return data_uri("image/png", stream.getvalue())
+    image.save(stream, kind)
+    return data_uri(f"image/{kind.lower()}", stream.getvalue())
+
+
+def png(alpha: np.ndarray, color: int = 255) -> str:
+    pixels = np.full((*alpha.shape, 4), color, np.uint8)
+    pixels[..., 3] = alpha
+    return encoded(Image.fromarray(pixels))
 
 
 @pytest.fixture
 def scene(tmp_path):
-    def scene(material: dict, picture: str | None = None, back: bool = False, binary: bool = False):
+    """Writes a scene, whose document `change` may change."""
+
+    def scene(material: dict, picture="", back=False, binary=False, change=lambda document: None):
         document: dict = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 1]}]}
         base = {"metallicFactor": 0, "roughnessFactor": 1}
         wall = {"pbrMetallicRoughness": base | {"baseColorFactor": RED}, "doubleSided": True}
-        pbr = base | material.pop("pbrMetallicRoughness", {"baseColorFactor": GREEN})
+        pbr = base | material.get("pbrMetallicRoughness", {"baseColorFactor": GREEN})
         if picture:
             pbr["baseColorTexture"] = {"index": 0}
             document |= {"images": [{"uri": picture}], "textures": [{"source": 0}]}
@@ -54,6 +61,7 @@ def scene(tmp_path):
             for i, shape in enumerate(shapes)
         ]
         document["nodes"] = [{"mesh": 0}, {"mesh": 1}]
+        change(document)
         file = tmp_path / "scene.gltf"
         file.write_text(json.dumps(document))
         if binary:
@@ -63,22 +71,8 @@ def scene(tmp_path):
     return scene
 
 
-@pytest.fixture
-def changed(scene):
-    """Writes a scene whose document a function has changed."""
-
-    def changed(change, *args) -> Path:
-        file = scene(*args)
-        document = json.loads(file.read_text())
-        change(document)
-        file.write_text(json.dumps(document))
-        return file
-
-    return changed
-
-
-def view(file):
-    return MeshRenderer(file, "y", SKY).render(X_WC, K, 32, 24)
+def view(file, X_WC=X_WC, K=K, up="y", scale=1.0):
+    return MeshRenderer(file, up, SKY, scale).render(X_WC, K, 32, 24)
 
 
 HALVES = np.repeat(np.r_[np.zeros(16), np.full(16, 255)][None], 32, axis=0)  # right half opaque
@@ -106,6 +100,9 @@ MASKED = {"alphaMode": "MASK", "alphaCutoff": 0.5}
 GLOWING = {"pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1]}, "emissiveFactor": [0, 0.9, 0]}
 
 
+WHITE = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}
+
+
 def green(alpha: float) -> dict:
     return {"pbrMetallicRoughness": {"baseColorFactor": [0, 0.8, 0, alpha]}}
 
@@ -118,14 +115,14 @@ def green(alpha: float) -> dict:
         ({"doubleSided": False}, png(HALVES), True, SURFACE),
         (MASKED, png(np.full((4, 4), 127)), False, HOLE),
         (MASKED, png(np.full((4, 4), 128)), False, SURFACE),
-        (MASKED | green(127 / 255), None, False, HOLE),
-        (MASKED | green(128 / 255), None, False, SURFACE),
-        (GLOWING, None, False, SURFACE),
+        (MASKED | green(127 / 255), "", False, HOLE),
+        (MASKED | green(128 / 255), "", False, SURFACE),
+        (GLOWING, "", False, SURFACE),
         (MASKED, "no%20where.png", False, SURFACE),
     ],
 )
 def test_surfaces_are_visible_or_not(opengl, scene, caplog, material, picture, back, expected):
-    assert sides(view(scene(dict(material), picture, back=back))) == [expected, expected]
+    assert sides(view(scene(material, picture, back))) == [expected, expected]
     missing = "cannot read the image no where.png" in caplog.text
     assert missing == (picture == "no%20where.png")
 
@@ -146,41 +143,36 @@ def test_holes_are_free(scene, mode, expected):
 
 
 def test_nothing_is_cut_behind_what_is_opaque(opengl, scene):
-    file = scene({"alphaMode": "MASK"}, png(HALVES))
     behind = look_along(np.array([6.0, 0, 0]), np.pi, 0.0)
-    frame = MeshRenderer(file, "y", SKY).render(behind, K, 32, 24)
+    frame = view(scene({"alphaMode": "MASK"}, png(HALVES)), behind)
     assert [color for color, _ in sides(frame)] == ["red", "red"]
     np.testing.assert_allclose(frame.depth[12, 8:24], 6 - WALL, atol=1e-4)
 
 
 def test_a_rolling_shutter_of_a_still_camera_changes_nothing(opengl, scene):
-    seen = MeshScene(scene({}, None), "y", (0.5, 0.5, 0.5), 1.0)
+    seen = MeshScene(scene({}), "y", (0.5, 0.5, 0.5), 1.0)
     camera = np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), 64, 48, RigidTransform()
     whole, rows = seen.render(*camera), seen.render(*camera, rows=(10, 30))
     for one, other in zip(rows, whole, strict=True):
         np.testing.assert_allclose(one, other[10:30], atol=1.1 / 255)
 
 
-def test_holes_turn_with_the_texture(opengl, changed):
+def test_holes_turn_with_the_texture(opengl, scene):
     def turn(document):
         info = document["materials"][1]["pbrMetallicRoughness"]["baseColorTexture"]
         transform = {"rotation": np.pi / 2, "offset": [0.0, 1.0], "scale": [1.0, 1.0]}
         info["extensions"] = {"KHR_texture_transform": transform}
 
-    bright = np.repeat(HALVES[..., None], 3, axis=2).astype(np.uint8)
-    stream = BytesIO()
-    Image.fromarray(bright).save(stream, "PNG")
-    opaque = data_uri("image/png", stream.getvalue())
-    white = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}
-    shown = view(changed(turn, dict(white), opaque)).color[..., 1] > 100
-    solid = np.abs(view(changed(turn, dict(MASKED), png(HALVES))).depth - QUAD) < 0.01
+    opaque = encoded(Image.fromarray(HALVES.astype(np.uint8)).convert("RGB"))
+    shown = view(scene(WHITE, opaque, change=turn)).color[..., 1] > 100
+    solid = np.abs(view(scene(MASKED, png(HALVES), change=turn)).depth - QUAD) < 0.01
     inside = (slice(9, 15), slice(13, 19))  # of the quad
     assert 0.2 < shown[inside].mean() < 0.8
     assert (shown[inside] == solid[inside]).mean() > 0.9
 
 
 @pytest.mark.parametrize("uri", ["grün weiß.png", "gr%C3%BCn%20wei%C3%9F.png"])
-def test_names_of_images_and_buffers_may_be_escaped(opengl, changed, tmp_path, uri):
+def test_names_of_images_and_buffers_may_be_escaped(opengl, scene, tmp_path, uri):
     Image.new("RGB", (4, 4), "white").save(tmp_path / "grün weiß.png")
 
     def write_out(document):
@@ -189,64 +181,48 @@ def test_names_of_images_and_buffers_may_be_escaped(opengl, changed, tmp_path, u
             (tmp_path / f"my café {number}.bin").write_bytes(content)
             buffer["uri"] = f"my%20caf%C3%A9%20{number}.bin"
 
-    assert sides(view(changed(write_out, {}, uri))) == [SURFACE, SURFACE]
+    assert sides(view(scene({}, uri, change=write_out))) == [SURFACE, SURFACE]
 
 
 @pytest.mark.parametrize(
     ("kind", "mode"), [("WEBP", "RGB"), ("PNG", "I;16"), ("PNG", "P"), ("JPEG", "RGB")]
 )
 def test_images_of_many_kinds(opengl, scene, kind, mode):
-    deep = mode == "I;16"
-    image = Image.fromarray(np.full((8, 8), 26000 if deep else 101, f"uint{16 if deep else 8}"))
-    stream = BytesIO()
-    (image if deep else image.convert(mode)).save(stream, kind)
-    uri = data_uri(f"image/{kind.lower()}", stream.getvalue())
-    white = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}
-    expected, seen = (
-        view(scene(dict(white), picture)).color[12, 16].astype(int)
-        for picture in (png(np.full((4, 4), 255), (101, 101, 101)), uri)
-    )
+    image = Image.fromarray(np.full((8, 8), 101, np.uint8)).convert("RGB" if mode == "P" else "L")
+    image = Image.fromarray(np.full((8, 8), 26000, np.uint16)) if mode == "I;16" else image
+    pictures = png(np.full((4, 4), 255), 101), encoded(image.convert(mode), kind)
+    expected, seen = (view(scene(WHITE, p)).color[12, 16].astype(int) for p in pictures)
     np.testing.assert_allclose(seen, expected, atol=2)
 
 
-def test_white_that_faces_up_is_not_clipped(opengl, changed):
+def test_white_that_faces_up_is_not_clipped(opengl, scene):
     up = {"mesh": 1, "rotation": [0, 0, np.sqrt(0.5), np.sqrt(0.5)]}  # at y = 2 m, up in the file
-    white = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}
-    file = changed(lambda document: document["nodes"].__setitem__(1, up), white)
-    X_WC = look_along(np.array([0, 0, 4.0]), 0.0, -np.pi / 2 + 1e-3)
-    color = MeshRenderer(file, "y", SKY).render(X_WC, K, 32, 24).color[12, 16]
+    file = scene(WHITE, change=lambda document: document["nodes"].__setitem__(1, up))
+    color = view(file, look_along(np.array([0, 0, 4.0]), 0.0, -np.pi / 2 + 1e-3)).color[12, 16]
     assert 230 < color.min() <= color.max() < 255
 
 
+SECOND = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1}}}
+
+
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("key", "values", "message"),
     [
-        (
-            lambda document: [node.update(scale=[1e3] * 3) for node in document["nodes"]],
-            "the longest side .* set scale=0.01 if .* centimeters, or scale=0.001 if .* millimet",
-        ),
-        (
-            lambda document: [node.update(scale=[0.01] * 3) for node in document["nodes"]],
-            "the longest side must be in .* set scale=1000 if it is in kilometers",
-        ),
-        (
-            lambda document: document.update(extensionsRequired=["KHR_mesh_quantization"]),
-            "without KHR_mesh_quantization, got .*gltf-transform dequantize",
-        ),
-        (
-            lambda document: document.update(extensionsRequired=["EXT_meshopt_compression"]),
-            "without EXT_meshopt_compression, got .*; deco",
-        ),
-        (
-            lambda document: document["materials"][1]["pbrMetallicRoughness"][
-                "baseColorTexture"
-            ].update(texCoord=1),
-            "texCoord of baseColorTexture must be 0, got 1",
-        ),
+        ("nodes", {"scale": [1e3] * 3}, "longest side .* scale=0.01 if .* centimeters, or .*=0.00"),
+        ("nodes", {"scale": [0.01] * 3}, "longest side must be in .* scale=1000 if .* kilometers"),
+        ("extensionsRequired", ["KHR_mesh_quantization"], "without KHR_mesh_q.*form dequantize"),
+        ("extensionsRequired", ["EXT_meshopt_compression"], "without EXT_meshopt_c.*; decompress"),
+        ("materials", SECOND, "texCoord of baseColorTexture must be 0, got 1"),
     ],
 )
-def test_meshes_that_cannot_be_worlds_are_refused(changed, change, message):
-    file = changed(change, {}, png(HALVES))
+def test_meshes_that_cannot_be_worlds_are_refused(scene, key, values, message):
+    def change(document):
+        if isinstance(values, list):
+            document[key] = values
+        else:
+            document[key] = [{**each, **values} for each in document[key]]
+
+    file = scene({}, png(HALVES), change=change)
     with pytest.raises(ValueError, match=message):
         check_mesh(file, "y")
         mesh_distance(file, "y", 0.1)
@@ -254,7 +230,7 @@ def test_meshes_that_cannot_be_worlds_are_refused(changed, change, message):
 
 def test_scale_is_the_unit_of_the_file(opengl, scene):
     file = scene({})
-    frame = MeshRenderer(file, "y", SKY, 2.0).render(X_WC, K, 32, 24)
+    frame = view(file, scale=2.0)
     assert frame.depth[12, 16] == pytest.approx(2 * QUAD, abs=1e-3)
     esdf = mesh_distance(file, "y", 0.1, 2.0)
     assert esdf.distance(np.array([4.5, 0, 0])) == pytest.approx(0.5, abs=0.1)
@@ -266,8 +242,7 @@ def test_vertex_colors_are_rendered(opengl, tmp_path, name):
     red = np.full((4, 4), [255, 0, 0, 255], np.uint8)
     trimesh.Trimesh(p, triangles, process=False, vertex_colors=red).export(tmp_path / name)
     up = "y" if name.lower().endswith("glb") else "z"
-    frame = MeshRenderer(tmp_path / name, up, SKY).render(X_WC, K, 32, 24)
-    assert sides(frame) == [HOLE, HOLE]
+    assert sides(view(tmp_path / name, up=up)) == [HOLE, HOLE]
 
 
 ROOM = np.array([6.0, 4.0, 3.0])  # [m]
@@ -311,7 +286,7 @@ def test_real_meshes_are_those_of_the_table(file, source):
 def test_pixels_on_edges_have_mean_colors_but_depth_of_their_centers(opengl, scene):
     shifted = K.copy()
     shifted[0, 2] += 0.4  # the quad ends in the left half of a pixel
-    frame = MeshRenderer(scene({}), "y", SKY).render(X_WC, shifted, 32, 24)
+    frame = view(scene({}), K=shifted)
     quad, edge, wall = frame.color[12, 23:26].astype(float)
     assert sides(frame) == [SURFACE, SURFACE]
     assert edge == pytest.approx((quad + wall) / 2, abs=1)

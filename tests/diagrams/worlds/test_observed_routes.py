@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -54,17 +54,17 @@ def test_views_as_captured_are_observed_and_views_back_and_of_the_frontier_are_n
     assert observed_routes.ObservedViews(hall).ahead(p_WB, np.pi) > 0.3
     wall = hall.gaussians.means[:, 0] > 11.99
     order = np.argsort(wall, kind="stable")
-    names = ("means", "quats", "scales", "opacities", "sh")
-    gaussians = replace(
-        hall.gaussians, **{name: getattr(hall.gaussians, name)[order] for name in names}
-    )
+    names = [field.name for field in fields(hall.gaussians)]
+    ordered = {name: getattr(hall.gaussians, name)[order] for name in names}
+    gaussians = replace(hall.gaussians, **ordered)
     closed = replace(hall, gaussians=gaussians, num_frontier=int(wall.sum()))
     # The wall of 3 m x 3 m is 3.9 m ahead of the camera; its edges blend with the walls beside it.
     inner, outer = ((side / 3.9) ** 2 / (2.0 * 1.5) for side in (2.2, 3.0))
     assert inner < observed_routes.ObservedViews(closed).ahead(p_WB, 0.0) < outer + 0.02
 
 
-def test_a_capture_that_covers_too_little_is_infeasible(capture):
+def test_a_capture_that_covers_too_little_is_infeasible(capture, monkeypatch):
+    monkeypatch.setattr(observed_routes, "_STARTS", 4)
     hall = capture([11.0])
     with pytest.raises(InfeasibleFlightError, match=r"at most 2%.*capture more"):
         observed_routes.choose_observed_route(hall, seed=0)

@@ -34,8 +34,12 @@ def world(box_room) -> World:
     return World("box", gaussians, esdf, esdf, (0.1, 0.2, 0.3), *ends)
 
 
-def test_round_trip(tmp_path, world):
-    folder = tmp_path / "scene"
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "scene"
+
+
+def test_round_trip(folder, world):
     written = scene_folder.write_scene_folder(
         folder, world, gains=np.array([1.0, 1.25]), representation="2dgs", image_width=320
     )
@@ -61,18 +65,17 @@ def test_round_trip(tmp_path, world):
 
 
 @pytest.fixture
-def painted(tmp_path, world, box_room):
-    """A scene folder with a frontier and a sky, what is in it, and what was written."""
+def painted(folder, world, box_room):
+    """What is written as a scene folder with a frontier and a sky."""
     texels = np.random.default_rng(0).random((8, 16, 3), np.float32)
     world = replace(world, background=EnvironmentMap(texels))
     frontier = box_room(6, 3, 3).gaussians(1.0)
-    folder = tmp_path / "scene"
     metadata = scene_folder.write_scene_folder(folder, world, frontier, provenance="first")
-    return folder, metadata, world, frontier
+    return metadata, world, frontier
 
 
-def test_frontier_and_environment_are_seen_in_flight_and_kept_apart(painted):
-    folder, metadata, world, frontier = painted
+def test_frontier_and_environment_are_seen_in_flight_and_kept_apart(folder, painted):
+    metadata, world, frontier = painted
     assert metadata.frontier and len(read_ply(folder / "gaussians.ply")) == len(world.gaussians)
     back = scene_folder.read_scene(folder)
     means = np.concatenate([world.gaussians.means, frontier.means])
@@ -82,8 +85,7 @@ def test_frontier_and_environment_are_seen_in_flight_and_kept_apart(painted):
     assert metadata.background == pytest.approx(mean_color(world.background))
 
 
-def test_a_scene_is_replaced_whole(painted, tmp_path, world):
-    folder, *_ = painted
+def test_a_scene_is_replaced_whole(folder, painted, tmp_path, world):
     (folder / "metrics.json").write_text("{}")
     scene_folder.write_scene_folder(folder, world, provenance="second")
     assert scene_folder.read_scene_metadata(folder).provenance == "second"
@@ -92,8 +94,7 @@ def test_a_scene_is_replaced_whole(painted, tmp_path, world):
     assert scene_folder.read_scene(folder).background == world.background
 
 
-def test_other_folders_are_not_overwritten(tmp_path, world):
-    folder = tmp_path / "holiday"
+def test_other_folders_are_not_overwritten(folder, world):
     folder.mkdir()
     scene_folder.check_scene_target(folder)
     (folder / "photo.jpg").write_bytes(b"x")
@@ -110,8 +111,7 @@ def test_other_folders_are_not_overwritten(tmp_path, world):
 @pytest.mark.parametrize(
     "missing", ["gaussians.ply", "esdf.npz", "scene.yaml", "frontier.ply", "environment.png"]
 )
-def test_missing_file_is_named(painted, missing):
-    folder, *_ = painted
+def test_missing_file_is_named(folder, painted, missing):
     (folder / missing).unlink()
     with pytest.raises(FileNotFoundError, match=rf"{missing}"):
         scene_folder.read_scene(folder)
@@ -132,8 +132,7 @@ def test_missing_file_is_named(painted, missing):
         ("metric: true", "metric: [", r"line 9: expected"),
     ],
 )
-def test_bad_metadata(tmp_path, world, old, new, message):
-    folder = tmp_path / "scene"
+def test_bad_metadata(folder, world, old, new, message):
     scene_folder.write_scene_folder(folder, world, provenance="")
     text = (folder / "scene.yaml").read_text()
     assert old in text
@@ -148,8 +147,7 @@ def test_bare_ply(tmp_path, box_room, with_stray):
     stray = GaussianScene.from_colors([[1000, 0, 0]], [[1, 0, 0, 0]], [[1] * 3], [0.9], [[1] * 3])
     write_ply(scene.merged_with(stray) if with_stray else scene, path)
     world = scene_folder.read_scene(path)
-    assert world.name == "hall"
-    assert len(world.gaussians) > 1000
+    assert world.name == "hall" and len(world.gaussians) > 1000
     assert world.distance_field is world.esdf and (world.esdf.upper_W < 10).all()
     # In the middle the walls are 1.5 m away, less their thickness.
     assert world.esdf.distance(np.array([3.0, 1.5, 1.5])) == pytest.approx(1.3, abs=0.2)
@@ -170,10 +168,7 @@ def room(box_room):
 @pytest.fixture(scope="module")
 def captured(room):
     """Depths and poses in the room near its end that look along it, one askew; makes a field."""
-    X_WCs = [
-        look_along(np.array([0.3, 2.0, 1.5]), 0.0, 0.0),
-        look_along(np.array([0.3, 1.0, 1.5]), 0.5, 0.0),
-    ]
+    X_WCs = [look_along(np.array([0.3, y, 1.5]), yaw, 0.0) for y, yaw in ((2.0, 0.0), (1.0, 0.5))]
     depths = [room.depth(X_WC) for X_WC in X_WCs]
     box = np.full(3, -0.4), room.size + 0.4
     return depths, X_WCs, partial(esdf_from_depth_images, depths, room.K, X_WCs, *box, VOXEL)
@@ -217,8 +212,7 @@ def test_frontier_is_seen_where_it_is_hit(room, closed):
         at_frontier = (np.abs(distances.distance(p_WQ)) < 0.02) & (field.distance(p_WQ) > 0.1)
         ends += at_frontier.sum()
         missed += (at_frontier & (seen(X_WC) > depth + 2 * VOXEL)).sum()
-    assert ends > 5000
-    assert missed < 0.01 * ends
+    assert ends > 5000 and missed < 0.01 * ends
     assert len(frontier) < 1000
 
 
