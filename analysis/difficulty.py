@@ -208,13 +208,9 @@ def traversability_obstacle(field: DistanceField, path: NDArray) -> float:
 
 
 def view_obstacle(field: DistanceField, path: NDArray) -> float:
-    """Computes FlightBench's VO: the mean proximity of obstacles in the view along the path (K, 3)
-    [m].
-
-    It is sum_k w_k R / d_k at every tenth of the sensing range R, looking along the path. d_k is
-    the distance to the nearest surface in ring k of the field of view (half angles of 36, 30, 22.5
-    and 15 degrees inwards, w = 0.05, 0.1, 0.3, 0.55) within R, found along 8 rays of each ring and
-    one ahead.
+    """Computes FlightBench's VO, the mean proximity of obstacles in the view along the path (K, 3)
+    [m]: sum_k w_k R / d_k at every tenth of the sensing range R. d_k is the distance to the nearest
+    surface within R in ring k (`_RINGS`), found along 8 rays of each ring and one ahead.
     """
     points = resample(path, SENSING_RANGE / 10)
     ahead = np.diff(points, axis=0)
@@ -260,19 +256,17 @@ def bottleneck(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray
     return low - VEHICLE_RADIUS
 
 
-def run(*, scenarios: Sequence[str], seeds: int) -> list[str]:
+def run(*, scenarios: Sequence[str], seeds: int) -> None:
     """Prints for each scenario how many seeds are feasible, the mean time of generation and the
-    mean difficulty, and returns the lines. Scenarios without their scene are not run."""
+    mean difficulty. Scenarios without their scene are not run."""
     names = ("trav", "gap", "TO", "VO", "AOL", "detour", "neck m")
-    lines = [f"{'scenario':<10}{'feasible':>10}{'CPU s':>7}" + "".join(f"{n:>8}" for n in names)]
-    print(lines[0], flush=True)
+    print(f"{'scenario':<10}{'feasible':>10}{'CPU s':>7}", *(f"{n:>8}" for n in names), sep="")
     for file in [scenario_file(name) for name in scenarios or benchmark_scenarios()]:
         try:
-            lines.append(f"{file.stem:<10}{_measure(file, seeds)}")
+            measured = _measure(file, seeds)
         except FileNotFoundError as error:
-            lines.append(f"{file.stem:<10} not run: {error}")
-        print(lines[-1], flush=True)
-    return lines
+            measured = f" not run: {error}"
+        print(f"{file.stem:<10}{measured}", flush=True)
 
 
 def _measure(file: Path, seeds: int) -> str:

@@ -8,6 +8,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import batched
 from pathlib import Path
 
 import numpy as np
@@ -156,8 +157,7 @@ def _read_entries(file: Path) -> dict[str, Entry]:
     entries = {}
     for name, content in (yaml_load_file(str(file)) or {}).items():
         try:
-            settings = tuple(content.pop("settings", ()))
-            entries[name] = Entry(**content, settings=settings)
+            entries[name] = Entry(**content | {"settings": tuple(content.get("settings", ()))})
             entries[name].validate()
         except (TypeError, ValueError, AttributeError) as error:
             raise ValueError(f"{file}: {name}: {error}") from None
@@ -172,9 +172,8 @@ def make(
     split: str = "",
     overrides: Sequence[str] = (),
 ) -> list[Record]:
-    """Makes and measures environments as the scene folders `scenes/NAME`, and records them.
-
-    The same call resumes. Rendered captures are kept in `scenes/captures/NAME`.
+    """Makes and measures environments as the scene folders `scenes/NAME`, and records them. The
+    same call resumes. Rendered captures are kept in `scenes/captures/NAME`.
 
     Args:
         names: of environments; if empty, all of the split whose sources exist.
@@ -186,14 +185,13 @@ def make(
     for name in names:
         if name not in entries:
             raise ValueError(unknown("environment", name, entries))
+        valid, remedy = split in ("", entries[name].split), "leave out the split, or the name"
+        require(valid, f"the split of {name}", split, entries[name].split, remedy)
     chosen = {
         name: entry
         for name, entry in entries.items()
-        if name in (names or entries) and (not split or entry.split == split)
+        if name in (names or entries) and split in ("", entry.split)
     }
-    for name in names:
-        remedy = "leave out the split, or the name"
-        require(name in chosen, f"the split of {name}", split, entries[name].split, remedy)
     require(chosen, "the split", "that of an environment", split)
     for entry in chosen.values():
         entry.config(overrides).validate()
@@ -240,8 +238,7 @@ def show(*, scenes: Path) -> list[Record]:
     `library.png`: a view of each onboard camera, color next to depth."""
     records = list(read_index(scenes).values())
     require(records, f"{scenes / INDEX}", "an index", "none", "`splatpilot library make` makes it")
-    table = pd.DataFrame([_row(record) for record in records])
-    print(table.rename(columns=_TITLES).to_string(index=False))
+    print(pd.DataFrame(map(_row, records)).to_string(index=False))
     for record in records:
         if record.feasible_seeds < _SEEDS:
             print(
@@ -254,14 +251,10 @@ def show(*, scenes: Path) -> list[Record]:
     return records
 
 
-_TITLES = {"name": "environment"} | {name: title for name, (title, _) in _TABLE.items()}
-
-
 def _row(record: Record) -> dict[str, str]:
-    values = asdict(record)
-    values["size"] = " x ".join(f"{length:.0f}" for length in record.size)
-    cells = {name: format_metric(values[name], form) for name, (_, form) in _TABLE.items()}
-    return {"name": record.name} | cells
+    values = asdict(record) | {"size": " x ".join(f"{length:.0f}" for length in record.size)}
+    cells = {title: format_metric(values[name], form) for name, (title, form) in _TABLE.items()}
+    return {"environment": record.name} | cells
 
 
 def read_index(scenes: Path) -> dict[str, Record]:
@@ -309,8 +302,7 @@ def _make(
         print(f"{scene}: is reconstructed already", flush=True)
         metrics = read_metrics(scene) if (scene / METRICS).is_file() else measure_scene(scene)
     else:
-        settings = config.reconstruct()
-        _, metrics = make_scene(capture=capture, out=scene, config=settings)
+        _, metrics = make_scene(capture=capture, out=scene, config=config.reconstruct())
     assert metrics is not None
     metadata = read_scene_metadata(scene)
     views = SceneViews(scene)
@@ -319,7 +311,6 @@ def _make(
         fidelity.run([scene], folder, FidelityConfig(reconstruct=config.reconstruct()))
         metadata = read_scene_metadata(scene)
     record = _record(name, entry, SceneConfig(path=str(scene.absolute())), metadata.source_digest)
-    depth_mae, depth_relative = flown_depth_error(views, read_scene_folder(scene))
     strict = metrics.as_json()["strict"]
     return replace(
         record,
@@ -327,8 +318,7 @@ def _make(
         license=entry.license or _mesh_license(source),
         frames=len(views.capture),
         **{metric: strict[metric] for metric in ("psnr_db", "ssim", "lpips")},
-        flown_depth_mae_m=depth_mae,
-        flown_depth_relative=depth_relative,
+        **flown_depth_errors(views, read_scene_folder(scene)),
         floaters=metrics.mean("floater_fraction"),
         holes=metrics.mean("hole_fraction"),
         unseen=metrics.flight_unseen_fraction,
@@ -374,9 +364,9 @@ def feasible_seeds(config: SceneSource, scene: World, seeds: int = _SEEDS) -> tu
     return count, reason
 
 
-def flown_depth_error(views: SceneViews, world: World) -> tuple[float | None, float | None]:
-    """Returns the mean error [m] of depth that the onboard camera outputs, and that relative to the
-    true depth, on the frames that measure a scene; None without true depth."""
+def flown_depth_errors(views: SceneViews, world: World) -> dict[str, float]:
+    """Computes the mean error [m] of the onboard camera's depth, and that relative to the true
+    depth, on the frames that measure a scene; empty without true depth."""
     errors, relative = [], []
     for i in Progress(views.measured, "depth as flown", unit="frame", leave=False):
         frame = views.frame(i)
@@ -392,11 +382,12 @@ def flown_depth_error(views: SceneViews, world: World) -> tuple[float | None, fl
         error = np.abs(depth[shown] - frame.depth[shown])
         errors.append(error.mean())
         relative.append((error / frame.depth[shown]).mean())
-    return (float(np.mean(errors)), float(np.mean(relative))) if errors else (None, None)
+    found = {"flown_depth_mae_m": errors, "flown_depth_relative": relative}
+    return {name: float(np.mean(values)) for name, values in found.items() if values}
 
 
 def _mesh_license(source: Path | str) -> str:
-    """Returns the license in `asset.extras` of a glTF file; empty without one."""
+    """Returns the license in `asset.extras` of a glTF file."""
     if not isinstance(source, Path) or source.suffix.lower() not in (".glb", ".gltf"):
         return ""
     content = source.read_bytes()
@@ -410,11 +401,10 @@ def _write_sheet(path: Path, records: Sequence[Record], scenes: Path) -> None:
     panels: list[Panel | None] = []
     for record in Progress(records, "contact sheet", unit="view", leave=False):
         panels += _panels(record, scenes)
-    columns = min(_COLUMNS, len(records))
-    per_row = 2 * columns
-    panels += [None] * (-len(panels) % per_row)
-    rows = [panels[k : k + per_row] for k in range(0, len(panels), per_row)]
-    write_grid(path, rows, ["color", "depth"] * columns, [""] * len(rows))
+    titles = ["color", "depth"] * min(_COLUMNS, len(records))
+    panels += [None] * (-len(panels) % len(titles))
+    rows = list(batched(panels, len(titles)))
+    write_grid(path, rows, titles, [""] * len(rows))
 
 
 def _panels(record: Record, scenes: Path) -> list[Panel]:

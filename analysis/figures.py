@@ -3,6 +3,7 @@
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import batched
 from pathlib import Path
 
 import cv2
@@ -144,7 +145,7 @@ def draw_sheet(corpus: Corpus, out: Path, count: int, seed: int = 0) -> None:
         tiles.append(np.concatenate(panels))
     columns = min(_COLUMNS, len(tiles))
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
-    rows = [np.concatenate(tiles[k : k + columns], axis=1) for k in range(0, len(tiles), columns)]
+    rows = [np.concatenate(row, axis=1) for row in batched(tiles, columns)]
     out.parent.mkdir(parents=True, exist_ok=True)
     with written_atomically(out) as path:
         path.write_bytes(cv2.imencode(".png", np.concatenate(rows)[..., ::-1])[1].tobytes())

@@ -232,9 +232,8 @@ def _plans(
     capture: Capture | None,
 ) -> list[Row]:
     rows = []
-    for number, viewpoint in enumerate(
-        Progress(viewpoints, f"planning in {scene}", unit="viewpoint")
-    ):
+    progress = Progress(viewpoints, f"planning in {scene}", unit="viewpoint")
+    for number, viewpoint in enumerate(progress):
         rng = np.random.default_rng([config.seed, number])
         draws = [_draw(rng, viewpoint.X_WCs[-1], config) for _ in range(config.draws)]
         images: dict[tuple[Any, ...], dict[str, tuple[list[View], float]]] = {}
@@ -243,17 +242,17 @@ def _plans(
             key = camera.width, camera.height, camera.focal_x, camera.max_depth
             if key not in images:
                 images[key] = _images(viewpoint, camera, capture)
-            X_CB = camera.mount().inverse()
+            X_WBs = [X_WC @ camera.mount().inverse() for X_WC in viewpoint.X_WCs]
             for kind, (views, seen) in images[key].items():
                 for draw, (v_WB, p_WG) in enumerate(draws):
-                    path = plan(policy, [X @ X_CB for X in viewpoint.X_WCs], views, v_WB, p_WG)
-                    p_WB = (viewpoint.X_WCs[-1] @ X_CB).translation()
+                    path = plan(policy, X_WBs, views, v_WB, p_WG)
                     # Outside the field, where distance is NaN, nothing is known to be hit.
                     nearest = np.nanmin(viewpoint.field.distance(path), initial=np.inf)
-                    clearance = float(nearest) - VEHICLE_RADIUS
-                    before, after = (np.linalg.norm(p_WG - p) for p in (p_WB, path[-1]))
-                    measured = seen, clearance, float(before - after), *map(float, path[-1])
-                    rows.append(Row(scene, name, kind, viewpoint.name, draw, *measured))
+                    ends = X_WBs[-1].translation(), path[-1]
+                    before, after = (np.linalg.norm(p_WG - p_WB) for p_WB in ends)
+                    measured = float(nearest) - VEHICLE_RADIUS, float(before - after)
+                    where = scene, name, kind, viewpoint.name, draw, seen
+                    rows.append(Row(*where, *measured, *map(float, path[-1])))
     return rows
 
 
@@ -272,8 +271,8 @@ def _draw(
 def _images(
     viewpoint: Viewpoint, camera: OnboardCamera, capture: Capture | None
 ) -> dict[str, tuple[list[View], float]]:
-    """Returns the images at the poses of a viewpoint by their kind, and the fraction of the last
-    one that is real; the rest of a real image is rendered."""
+    """Returns the images of a viewpoint by their kind, and the fraction of the last one that is
+    real; the rest of a real image is rendered."""
     K, size = camera.camera_info().intrinsic_matrix(), (camera.width, camera.height)
     limits = camera.min_depth, camera.max_depth
     rendered, real, seen = [], [], 0.0
@@ -296,8 +295,7 @@ def _images(
 def _exposed(
     rendered: NDArray[np.uint8], real: NDArray[np.uint8], valid: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
-    """Returns the rendering with the gain that fits it to the valid pixels of the real image, so
-    that no edge stands where that one ends."""
+    """Fits a rendering by a gain to the valid pixels of the real image, so that no edge remains."""
     a, b = rendered[valid].astype(float), real[valid].astype(float)
     gain = float((a * b).sum() / max((a * a).sum(), 1.0)) if valid.any() else 1.0
     return color_pixels(rendered * (gain / 255.0))
@@ -306,12 +304,9 @@ def _exposed(
 def _photograph(
     capture: Capture, i: int, K: NDArray, width: int, height: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
-    """Resamples a frame: color (H, W, 3), depth (H, W) [m], 0 unknown, and the mask of pixels that
-    the frame shows."""
-    frame = capture.frame(i)
-    frame = shrink(
-        frame, shrink_factor(capture.width, round(capture.width * K[0, 0] / capture.K[0, 0]))
-    )
+    """Resamples a frame: color (H, W, 3), depth (H, W) [m], 0 unknown, and mask of shown pixels."""
+    desired = round(capture.width * K[0, 0] / capture.K[0, 0])
+    frame = shrink(capture.frame(i), shrink_factor(capture.width, desired))
     h, w = frame.depth.shape
     maps = resampling_maps(Lens(frame.K, w, h), Lens(K, width, height))
     if maps is None:
@@ -361,15 +356,13 @@ def summarize(rows: Sequence[Row]) -> dict[str, Any]:
     """Returns, by scene and policy, the fraction of plans without a collision by each kind of
     images; that by real ones less that by rendered ones, with the 95 % interval of a bootstrap over
     viewpoints; and the mean distance [m] between the ends of both plans."""
-    table: dict[str, Any] = {}
+    groups: dict[tuple[str, str], dict[str, list[Row]]] = {}
     for row in rows:
-        table.setdefault(row.scene, {}).setdefault(row.policy, {}).setdefault(
-            row.images, []
-        ).append(row)
-    return {
-        scene: {policy: _compare(kinds) for policy, kinds in policies.items()}
-        for scene, policies in table.items()
-    }
+        groups.setdefault((row.scene, row.policy), {}).setdefault(row.images, []).append(row)
+    table: dict[str, Any] = {}
+    for (scene, policy), kinds in groups.items():
+        table.setdefault(scene, {})[policy] = _compare(kinds)
+    return table
 
 
 def _compare(kinds: dict[str, list[Row]]) -> dict[str, Any]:
@@ -378,19 +371,17 @@ def _compare(kinds: dict[str, list[Row]]) -> dict[str, Any]:
         found[kind] = float(np.mean([row.clearance > 0.0 for row in rows]))
         found[f"{kind}_progress"] = float(np.mean([row.progress for row in rows]))
     if "real" in kinds:
-        pairs = list(zip(kinds["real"], kinds["rendered"], strict=True))
         by_viewpoint: dict[str, list[float]] = {}
-        for real, rendered in pairs:
-            by_viewpoint.setdefault(real.viewpoint, []).append(
-                float(real.clearance > 0.0) - float(rendered.clearance > 0.0)
-            )
+        apart = []
+        for real, rendered in zip(kinds["real"], kinds["rendered"], strict=True):
+            gap = float(real.clearance > 0.0) - float(rendered.clearance > 0.0)
+            by_viewpoint.setdefault(real.viewpoint, []).append(gap)
+            apart.append(np.linalg.norm(np.subtract(real[-3:], rendered[-3:])))
         gaps = np.array([np.mean(values) for values in by_viewpoint.values()])
         drawn = np.random.default_rng(0).integers(len(gaps), size=(_RESAMPLES, len(gaps)))
         found["gap"] = float(gaps.mean())
         found["gap_interval"] = np.quantile(gaps[drawn].mean(axis=1), [0.025, 0.975]).tolist()
-        found["plans_apart"] = float(
-            np.mean([np.linalg.norm(np.subtract(a[-3:], b[-3:])) for a, b in pairs])
-        )
+        found["plans_apart"] = float(np.mean(apart))
         found["seen"] = float(np.mean([row.seen for row in kinds["real"]]))
     return found
 

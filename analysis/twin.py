@@ -160,13 +160,8 @@ def captured_mesh(scene: Path) -> MeshWorld:
             f"{scene} must be of a rendered capture, got {capture or 'an unknown one'} without "
             f"{RECIPE}; render one by `splatpilot capture render`"
         )
-    config = recipe.config
-    return MeshWorld(
-        path=str(Path(capture) / recipe.mesh),
-        up=config.up,
-        scale=config.scale,
-        background=config.background,
-    )
+    same = {name: getattr(recipe.config, name) for name in ("up", "scale", "background")}
+    return MeshWorld(path=str(Path(capture) / recipe.mesh), **same)
 
 
 def draw_routes(scene: Path, mesh: World, count: int) -> list[Route]:
@@ -227,8 +222,8 @@ def predictions(
     """
     environments = list(dict.fromkeys(pair["environment"] for pair in pairs))
     policies = list(dict.fromkeys(pair["policy"] for pair in pairs))
-    cubes = {kind: _cube(pairs, kind, environments, policies) for kind in ("splat", "mesh")}
-    again = _cube(pairs, "again", environments, policies) if "again" in pairs[0] else None
+    kinds = [kind for kind in ("splat", "mesh", "again") if kind in pairs[0]]
+    cubes = {kind: _cube(pairs, kind, environments, policies) for kind in kinds}
     found = ([row["success"] for row in control if _flown_policy(row) == p] for p in policies)
     generated = np.array([np.mean(successes or [np.nan]) for successes in found])
     table = []
@@ -237,10 +232,10 @@ def predictions(
         mesh, splat = cubes["mesh"][part], cubes["splat"][part]
         row: dict[str, Any] = {"environment": name, "flights": mesh.size}
         row |= {"mesh": mesh.mean(), "splat": splat.mean()}
-        row |= {"agreement": np.mean(mesh == splat), "kappa": cohen_kappa(mesh, splat)}
-        if again is not None:
-            row["again_agreement"] = np.mean(mesh == again[part])
-            row["again_kappa"] = cohen_kappa(mesh, again[part])
+        for kind, prefix in zip(kinds[::2], ("", "again_"), strict=False):
+            other = cubes[kind][part]
+            row[f"{prefix}agreement"] = np.mean(mesh == other)
+            row[f"{prefix}kappa"] = cohen_kappa(mesh, other)
         row |= _correlations(mesh, splat, generated)
         table.append({name: round(x, 4) if isinstance(x, float) else x for name, x in row.items()})
     return table
@@ -318,19 +313,14 @@ def _write_figure(path: Path, pairs: Sequence[dict[str, Any]], control: Sequence
 
     policies = list(dict.fromkeys(pair["policy"] for pair in pairs))
     figure = Figure(figsize=(10, 4), layout="constrained")
-    panels = figure.subplots(1, 2 if control else 1, sharey=True, squeeze=False)[0]
     flights = [row | {"policy": _flown_policy(row)} for row in control]
+    drawn = {"reconstructions": (pairs, "splat"), "generated worlds": (flights, "success")}
+    panels = figure.subplots(1, 2 if control else 1, sharey=True, squeeze=False)[0]
 
     def rate(rows: Sequence[Row], policy: str, column: str) -> float:
         return float(np.mean([row[column] for row in rows if row["policy"] == policy]))
 
-    for axes, rows, column, where in zip(
-        panels,
-        (pairs, flights),
-        ("splat", "success"),
-        ("reconstructions", "generated worlds"),
-        strict=False,
-    ):
+    for axes, (where, (rows, column)) in zip(panels, drawn.items(), strict=False):
         for policy, marker in zip(policies, cycle("os^vDPX*<>"), strict=False):
             xy = rate(rows, policy, column), rate(pairs, policy, "mesh")
             axes.plot(*xy, marker, alpha=0.7, markersize=8, clip_on=False, label=policy)

@@ -28,11 +28,7 @@ from splatpilot.diagrams.worlds.scene_folder import (
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world, scene_config
 from splatpilot.systems.common.config import load_config
-from splatpilot.systems.common.files import (
-    require_unused,
-    require_writable_folder,
-    write_text,
-)
+from splatpilot.systems.common.files import require_unused, require_writable_folder, write_text
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.scene import GaussianScene
@@ -67,9 +63,9 @@ def run(
     overrides: Sequence[str] = (),
     overwrite: bool = False,
 ) -> Path:
-    """Writes a page of a scene folder, a file of Gaussians, an OctoMap, a capture or a scenario.
-    The default `out` is `out/view/NAME.html`, or `NAME-SEED.html` of a generated world; `overrides`
-    are FIELD=VALUE of the scenario, or of the capture's `CaptureConfig`."""
+    """Writes a page of a scene folder, a file of Gaussians, an OctoMap, a capture or a scenario, by
+    default `out/view/NAME.html`, or `NAME-SEED.html` of a generated world. `overrides` are
+    FIELD=VALUE of the scenario, or of the capture's `CaptureConfig`."""
     path = Path(what)
     name = path.resolve().name if path.is_dir() else path.stem
     scenario = generated_scenario(path, seed, overrides)
@@ -77,16 +73,14 @@ def run(
         name = f"{name}-{scenario.seed:03d}"
     out = out or Path("out/view") / f"{name}.html"
     require_unused(out, overwrite)
+    is_scene = (path / "scene.yaml").is_file()
     if scenario is not None:
         shown = _generated(scenario)
-    elif not (path / "scene.yaml").is_file() and not _may_hold_gaussians(path):
+    elif not is_scene and not _may_hold_gaussians(path):
         shown = _capture(path, overrides)
     else:
-        if overrides:
-            raise ValueError(
-                f"--set must be of a scenario or a capture, got {overrides[0]}; leave it out"
-            )
-        is_scene = (path / "scene.yaml").is_file()
+        found, remedy = "".join(overrides[:1]), "leave it out"
+        require(not overrides, "--set", "of a scenario or a capture", found, remedy)
         shown = _scene(path) if is_scene else _gaussians(path)
     require_writable_folder(out.absolute().parent)
     meshcat = empty_meshcat(shown.background)
@@ -163,9 +157,8 @@ def _gaussians(path: Path) -> ViewerScene:
 
 
 def _origin_notes(origin: Sequence[float]) -> list[str]:
-    if not any(origin):
-        return []
-    return [f"Positions are relative to {', '.join(f'{x:.10g}' for x in origin)} of the files."]
+    text = ", ".join(f"{x:.10g}" for x in origin)
+    return [f"Positions are relative to {text} of the files."] if any(origin) else []
 
 
 def _capture(path: Path, overrides: Sequence[str]) -> ViewerScene:
@@ -173,10 +166,7 @@ def _capture(path: Path, overrides: Sequence[str]) -> ViewerScene:
     capture = read_capture(path, load_config(CaptureConfig(), overrides=fields))
     gaussians = capture_gaussians(capture, _shown_frames(capture))
     if gaussians is None:
-        raise ValueError(
-            f"{path} has neither depth nor points, so there is nothing to view; reconstruct it "
-            "first"
-        )
+        raise ValueError(f"{path} has neither depth nor points to view; reconstruct it first")
     images = _captured_images(capture)
     lower_W, upper_W = _bounds(gaussians.means)
     notes = ["Points of the capture; `splatpilot reconstruct` makes surfaces of them."]

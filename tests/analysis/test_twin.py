@@ -21,7 +21,8 @@ def make_pairs(mesh, splat) -> list[dict]:
     ]
 
 
-def test_intervals_cover_the_truth_and_shrink_with_routes():
+def test_intervals_cover_the_truth_and_shrink_with_routes(monkeypatch):
+    monkeypatch.setattr(twin, "_RESAMPLES", 1000)
     rng, rates, widths = np.random.default_rng(1), np.linspace(0.05, 0.95, 12)[:, None], []
     for routes in (5, 80):
         mesh, splat = (rng.uniform(size=(2, 12, routes)) < rates for _ in range(2))
