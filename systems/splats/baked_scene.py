@@ -176,15 +176,16 @@ class BakedScene:
             distortion: Lens; a pinhole if None. Pixels without a ray are black, with alpha and
                 depth 0.
             max_depth: Gaussians beyond this depth [m] are left out of the depth image.
-            merged_spread: Neighbors that spread by less on the image [px] are drawn as one, which
-                is faster where Gaussians are smaller than pixels; 0 merges none. The first such
-                image prepares the scene.
+            merged_spread: Neighbors that spread by less on the image [px] are drawn as one in
+                color and alpha, which is faster where Gaussians are smaller than pixels; 0 merges
+                none. The first such image prepares the scene.
             rows: The first row to render, and the one after the last; by default all.
         """
         options = {"moving": moving, "distortion": distortion, "max_depth": max_depth}
         options |= {"background": background, "merged_spread": merged_spread, "rows": rows}
         camera = K, width, height, X_WC, near, far
-        return _render_all(self._render, self._antialiased, *camera, **options)
+        apart = self._antialiased or merged_spread > 0
+        return _render_all(self._render, apart, *camera, **options)
 
     def render_color(self, *camera: Any, **options: Any) -> NDArray[np.float32]:
         """Renders the color (H, W, 3), bitwise identical to that of `render` but faster.
@@ -213,7 +214,7 @@ class BakedScene:
         **options: Any,
     ) -> RenderedView:
         """Renders images of these names; the others are empty."""
-        camera = _checked_camera(K, width, height, *clip, **options)
+        camera = _checked_camera(names, K, width, height, *clip, **options)
         (color,) = _background_colors([background])
         slopes = _slopes(K, width, height, [background], **options)
         images = _new_images(names, (), width, height, options.get("rows"))
@@ -247,6 +248,7 @@ class BatchRenderer:
             options: the same; `backgrounds` are those of the N views, black by default.
         """
         apart = any(scene._antialiased for scene in cameras[0])
+        apart |= options.get("merged_spread", 0.0) > 0
         return _render_all(self._render, apart, *cameras, **options)
 
     def render_color(self, *cameras: Any, **options: Any) -> NDArray[np.float32]:
@@ -275,7 +277,7 @@ class BatchRenderer:
         for name, rows in (("poses", X_WCs), ("backgrounds", backgrounds)):
             condition = f"that of scenes, {count}"
             require(len(rows) == count, f"the number of {name}", condition, len(rows))
-        camera = _checked_camera(K, width, height, *clip, **options)
+        camera = _checked_camera(names, K, width, height, *clip, **options)
         slopes = _slopes(K, width, height, backgrounds, **options)
         images = _new_images(names, (count,), width, height, options.get("rows"))
         _native.render_views(
@@ -291,8 +293,8 @@ class BatchRenderer:
 def _render_all(
     render: Callable[..., RenderedView], apart: bool, *cameras: Any, **options: Any
 ) -> RenderedView:
-    """Renders all images, color and depth `apart` for scenes that were trained antialiased: blur
-    makes their opacities lower for color than for depth."""
+    """Renders all images, color and depth `apart` if their Gaussians differ: where neighbors merge,
+    and in scenes that were trained antialiased, whose opacities blur makes lower for color."""
     if not apart:
         return render(_ALL, *cameras, **options)
     depth = render(("depth",), *cameras, **options).depth
@@ -368,6 +370,7 @@ def _finished(
 
 
 def _checked_camera(
+    names: tuple[str, ...],
     K: ArrayLike,
     width: int,
     height: int,
@@ -394,7 +397,8 @@ def _checked_camera(
         lens = whole.with_rows(part)._asdict()
 
     def make(scene: BakedScene, X_WC: "RigidTransform") -> _native.Camera:
-        if merged_spread:
+        merged = merged_spread if "color" in names else 0.0
+        if merged:
             scene._scene.merge_neighbors()
         return _native.Camera(
             K=K_rows,
@@ -407,7 +411,7 @@ def _checked_camera(
             far_plane=far,
             eps2d=EPS2D,
             max_depth=max_depth,
-            merged_spread=merged_spread,
+            merged_spread=merged,
             antialiased=scene._antialiased,
             **lens,
         )
