@@ -18,7 +18,6 @@ from pydrake.systems.framework import (
     PortDataType,
     System,
 )
-from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.systems.sensors import ImageDepth16U, ImageDepth32F, ImageRgba8U
 
 from splatpilot.diagrams.flight.blocks import DecisionInput
@@ -203,7 +202,7 @@ class FlightEnv(gymnasium.Env):
         context.SetTime(0.0)
         self.diagram.SetDefaultContext(context)
         set_state(self.parts.plant.GetMyMutableContextFromRoot(context), state)
-        source = cast(ConstantVectorSource, self.parts.goal.get_system())
+        source: Any = self.parts.goal.get_system()
         goal = source.get_mutable_source_value(source.GetMyMutableContextFromRoot(context))
         goal.SetFromVector(p_WG)
         if self._flight.native:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, shape_rows
+from splatpilot.systems.common.config import is_configuration
 from splatpilot.systems.common.distributions import is_distribution
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import MAX_SEED, require, require_type
@@ -203,30 +205,27 @@ def add_field(worlds: _native.FlightWorlds, field: DistanceField, name: str) -> 
 def require_supported(config: FlightEnvConfig, scenario: Scenario) -> None:
     """Raises ValueError, with the name of the field, for what `VectorFlightEnv` cannot fly;
     `scenario` is that of the configuration, drawn."""
-    vehicle, simulator = scenario.vehicle, scenario.simulator
-    scheme, estimator = simulator.integration_scheme, type(scenario.estimator).__name__
-    images = [n for n in config.observation_names() if n in IMAGES]
-    disturbance = scenario.controller.disturbance_time
-    neutral: dict[str, tuple[bool, str, Any]] = {
-        "moving": (not scenario.moving, "empty", list(scenario.moving)),
-        "estimator": (isinstance(scenario.estimator, TrueState), "TrueState", estimator),
-        "wind.gusts": (scenario.wind.gusts == 0.0, "0", scenario.wind.gusts),
-        "controller.disturbance_time": (disturbance == 0.0, "0", disturbance),
-        "vehicle.model": (vehicle.model == "lags", "lags", vehicle.model),
-        "vehicle.battery_sag": (vehicle.battery_sag == 0.0, "0", vehicle.battery_sag),
-        "vehicle.ground_effect": (vehicle.ground_effect == 0.0, "0", vehicle.ground_effect),
-        "simulator.integration_scheme": (scheme == "runge_kutta5", "runge_kutta5", scheme),
-        "simulator.use_error_control": (
-            not simulator.use_error_control, "false", simulator.use_error_control
-        ),
-        "observation": (
-            not images or scenario.observation == ObservationNoise(), "left out", "noise or latency"
-        ),
-        "imaging": (not images or scenario.imaging == Imaging(), "left out", "image formation"),
-        "camera.readout": (not images or config.camera.readout == 0.0, "0", config.camera.readout),
-    }  # fmt: skip
-    for name, (valid, condition, value) in neutral.items():
-        require(valid, f"{name} of VectorFlightEnv", condition, value, _OTHER)
+    neutral = {
+        "moving": {},
+        "estimator": TrueState(),
+        "wind.gusts": 0,
+        "controller.disturbance_time": 0,
+        "vehicle.model": "lags",
+        "vehicle.battery_sag": 0,
+        "vehicle.ground_effect": 0,
+        "simulator.integration_scheme": "runge_kutta5",
+        "simulator.use_error_control": False,
+    }
+    if any(name in IMAGES for name in config.observation_names()):
+        neutral |= {"observation": ObservationNoise(), "imaging": Imaging()}
+        readout = config.camera.readout
+        require(readout == 0.0, "camera.readout of VectorFlightEnv", "0", readout, _OTHER)
+    for name, value in neutral.items():
+        found, condition = attrgetter(name)(scenario), str(value)
+        valid = found == value
+        if is_configuration(value):
+            found, condition = type(found).__name__, "left out"
+        require(valid, f"{name} of VectorFlightEnv", condition, found, _OTHER)
     longest, period = max(scenario.decision_delay, default=0.0), 1.0 / config.rate
     condition = f"at most the policy's period, {period:g} s, in VectorFlightEnv"
     require(longest <= period + 1e-9, "decision_delay", condition, longest, _OTHER)

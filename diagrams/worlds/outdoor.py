@@ -142,11 +142,8 @@ def _limbs_and_wires(
         ends[:, [0, 2]] += rng.uniform(-0.8, 0.8, (2, 2))
         radius = rng.uniform(config.thickness_min, config.thickness_max) / 2
         thin.append(Solid(Capsule(ends[0], ends[1], float(radius)), "cable", k))
-    return [
-        s
-        for s in thin
-        if blocks.has_clearance(s.shape, [forest.p_WS, forest.p_WG], blocks.TIGHT_CLEARING)
-    ]
+    clear = [forest.p_WS, forest.p_WG], blocks.TIGHT_CLEARING
+    return [solid for solid in thin if blocks.has_clearance(solid.shape, *clear)]
 
 
 PATTERNS = "big_wall", "u_trap", "slits", "slalom"
@@ -225,12 +222,9 @@ def _u_trap(config: WallsConfig, rng: np.random.Generator) -> list[Solid]:
     y = rng.uniform(-0.4, 0.4) * spare
     low, high = y - config.wall / 2, y + config.wall / 2
     paint = _paint(rng)
-    sides = [
-        blocks.box(
-            (x - config.depth, a, 0), (x - blocks.WALL / 2, a + blocks.WALL, config.height), *paint
-        )
-        for a in (low, high - blocks.WALL)
-    ]
+    x0, x1, wall, height = x - config.depth, x - blocks.WALL / 2, blocks.WALL, config.height
+    starts = low, high - wall
+    sides = [blocks.box((x0, a, 0), (x1, a + wall, height), *paint) for a in starts]
     return [_across(config, x, low, high, *paint), *sides]
 
 

@@ -1,4 +1,4 @@
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ def test_views_as_captured_are_observed_and_views_back_and_of_the_frontier_are_n
     assert observed_routes.ObservedViews(hall).ahead(p_WB, np.pi) > 0.3
     wall = hall.gaussians.means[:, 0] > 11.99
     order = np.argsort(wall, kind="stable")
-    names = [field.name for field in fields(hall.gaussians)]
+    names = ("means", "quats", "scales", "opacities", "sh")
     ordered = {name: getattr(hall.gaussians, name)[order] for name in names}
     gaussians = replace(hall.gaussians, **ordered)
     closed = replace(hall, gaussians=gaussians, num_frontier=int(wall.sum()))
