@@ -10,7 +10,7 @@ a sensing range of 4 m and a field of view of 72 degrees.
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -270,6 +270,8 @@ def run(*, scenarios: Sequence[str], seeds: int) -> None:
 
 
 def _measure(file: Path, seeds: int) -> str:
+    import pandas as pd
+
     config = load_config(Scenario(), file).world
     rows, spent = [], []
     for seed in Progress(range(seeds), f"measuring {file.stem}", unit="world", leave=False):
@@ -279,9 +281,8 @@ def _measure(file: Path, seeds: int) -> str:
                 world = make_world(config, seed)
             finally:
                 spent.append(time.process_time() - started)
-            rows.append(list(vars(world_difficulty(world, world.p_WS, world.p_WG, seed)).values()))
-    feasible, rows = len(rows), rows or [[np.nan] * len(fields(Difficulty))]
-    known = np.isfinite(rows).sum(axis=0)  # measures that a world may not have
-    means = np.where(known > 0, np.nansum(rows, axis=0) / np.maximum(known, 1), np.nan)
-    columns = f"{f'{feasible}/{seeds}':>10}{np.mean(spent):>7.2f}"
+            rows.append(astuple(world_difficulty(world, world.p_WS, world.p_WG, seed)))
+    # Worlds may be without some measures, which pandas leaves out.
+    means = pd.DataFrame(rows, columns=[field.name for field in fields(Difficulty)]).mean()
+    columns = f"{f'{len(rows)}/{seeds}':>10}{np.mean(spent):>7.2f}"
     return columns + "".join(f"{mean:>8.2f}" for mean in means)

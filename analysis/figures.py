@@ -2,9 +2,9 @@
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import batched
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,16 +25,14 @@ _GRAY = 0.35  # of unknown values
 _CELL = 2.6  # [in], width of an image
 
 
-@dataclass(frozen=True, eq=False)
-class Panel:
+class Panel(NamedTuple):
     """One image of a grid."""
 
     image: NDArray  # (H, W, 3), 0 to 1
     label: str = ""  # in the lower left corner
 
 
-@dataclass(frozen=True)
-class Scale:
+class Scale(NamedTuple):
     """Color scale of a row."""
 
     colors: str

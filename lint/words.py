@@ -59,13 +59,12 @@ def count_hits(root: Path) -> Counter[str]:
         text=True,
         check=True,
     ).stdout.split()
-    files = [name for name in listed if not name.startswith(("tests/", "lint/"))]
-    hits = {
-        name: sum(bool(PATTERN.search(line)) for line in (root / name).read_text().splitlines())
-        for name in files
-        if (root / name).is_file()
-    }
-    return Counter({name: count for name, count in hits.items() if count})
+    hits = Counter()
+    for name in listed:
+        if not name.startswith(("tests/", "lint/")) and (root / name).is_file():
+            lines = (root / name).read_text().splitlines()
+            hits[name] = sum(bool(PATTERN.search(line)) for line in lines)
+    return +hits
 
 
 def main() -> int:

@@ -14,7 +14,7 @@ from room import write_room_capture
 SCENARIO = """\
 world: {length: 8, width: 5, height: 3, rocks: 0, logs: 0, voxel_size: 0.25}
 camera: {width: 64, height: 48}
-timeout: 0.8
+timeout: 0.4
 """
 COMMANDS = {
     "fly": (
@@ -26,8 +26,8 @@ COMMANDS = {
         "*.yaml rollouts.csv table.csv rollouts/* scenarios/*",
     ),
     "reconstruct": (
-        "reconstruct room --overwrite --out out/scene --set iterations=12 --set voxel_size=0.2"
-        " --set threads=1 --set checkpoint_every=4 --set initial_gaussians=500"
+        "reconstruct room --overwrite --out out/scene --set iterations=6 --set voxel_size=0.3"
+        " --set threads=1 --set checkpoint_every=2 --set initial_gaussians=500"
         " --set lpips_weight=0",
         "scene/*",
     ),

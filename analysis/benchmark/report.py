@@ -28,7 +28,7 @@ from splatpilot.analysis.figures import write_png
 from splatpilot.diagrams.flight.scenario import goal_position, sample_scenario
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.common.files import write_text
 from splatpilot.systems.common.provenance import SPLIT_NAMES, describe_seeds
 from splatpilot.systems.vehicle.state import QuadrotorState
 
@@ -87,13 +87,9 @@ def write_report(
     }
     body = [f"<h1>{title}</h1><p>{_scope(config, rows)}</p>", _warnings(rows, absent, damaged)]
     body += [f"<h2>{heading}</h2>{section}" for heading, section in sections.items() if section]
-    with written_atomically(folder.path / "report.html") as path:
-        path.write_text(
-            f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-            f"{_VIEWPORT}<style>{_STYLE}</style></head><body>"
-            + "\n".join(body)
-            + "</body></html>\n"
-        )
+    head = f'<meta charset="utf-8"><title>{title}</title>{_VIEWPORT}<style>{_STYLE}</style>'
+    start = f'<!DOCTYPE html><html lang="en"><head>{head}</head><body>'
+    write_text(folder.path / "report.html", start + "\n".join(body) + "</body></html>\n")
 
 
 class _Html(str):

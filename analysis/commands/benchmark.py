@@ -148,7 +148,7 @@ def benchmark(options: argparse.Namespace) -> Any:
     cli.OVERWRITE,
     examples=(
         "replay out/study P08-reactive-2-003 --meshcat --video",
-        "replay out/study P08-planner-2-003 P08-reactive-2-003 --overwrite",
+        "replay out/study P08-planner-2-003 P08-reactive-2-003",
     ),
 )
 def replay(options: argparse.Namespace) -> None:

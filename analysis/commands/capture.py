@@ -32,13 +32,7 @@ def _defaults(options: argparse.Namespace) -> Any:
     cli.flag("--restart", "discard an interrupted run"),
     cli.OVERWRITE,
     cli.set_option(
-        *(
-            "iterations=3000",
-            "voxel_size=0.1",
-            "image_width=640",
-            "max_gaussians=200000",
-            "device=cuda",
-        ),
+        *("iterations=3000", "voxel_size=0.1", "image_width=640", "device=cuda"),
         configuration=_defaults,
     ),
     examples=(
@@ -75,10 +69,7 @@ def reconstruct(options: argparse.Namespace) -> None:
         configuration="splatpilot.training.captures.check:CheckConfig",
     ),
     cli.json_option("the report"),
-    examples=(
-        "capture check data/hospital",
-        "capture check data/office --set capture.depth_unit=5000 --json",
-    ),
+    examples=("capture check data/office --set capture.depth_unit=5000 --json",),
 )
 def check(options: argparse.Namespace) -> Any:
     """Projects depth from frame to frame and compares. If it disagrees, tests the usual errors,
@@ -132,9 +123,7 @@ _OUT = cli.out_option("folder of scenes (default: $SPLATPILOT_SCENES, or scenes)
 
 @cli.command(
     "library make",
-    cli.Option(
-        "names", "hospital, cafe, ... (default: all whose sources exist)", nargs="*", metavar="NAME"
-    ),
+    cli.Option("names", "hospital, ... (default: all with sources)", nargs="*", metavar="NAME"),
     cli.Option("--data", "folder of captures, meshes and maps (default: $SPLATPILOT_DATA)", Path),
     cli.Option("--split", "only this split", choices=("train", "validation", "test"), default=""),
     _OUT,
@@ -180,7 +169,7 @@ def pack(options: argparse.Namespace) -> None:
     `library get` reads. The scenes are those of $SPLATPILOT_SCENES, or of the folder scenes."""
     from splatpilot.analysis import scene_downloads
 
-    packed = scene_downloads.pack(names=options.names, scenes=scenes_folder(), out=options.out)
+    packed = cli.call(scene_downloads.pack, options, scenes=scenes_folder())
     for name, scene in packed.items():
         size = sum(file.bytes for file in scene.files.values())
         print(f"Wrote {options.out / name}, {size / 1e6:.1f} MB; license: {scene.license}")
@@ -189,9 +178,7 @@ def pack(options: argparse.Namespace) -> None:
 @cli.command(
     "library get",
     cli.Option("names", "of scenes", nargs="+", metavar="NAME"),
-    cli.Option(
-        "--from", "folder, or its URL, that `library pack` wrote", dest="source", required=True
-    ),
+    cli.Option("--from", "folder or URL of `library pack`", dest="source", required=True),
     _OUT,
     examples=("library get small_house --from out/packed",),
 )
@@ -199,6 +186,4 @@ def get(options: argparse.Namespace) -> None:
     """Copies packed scenes from a folder or a file server, and checks their digests."""
     from splatpilot.analysis import scene_downloads
 
-    scene_downloads.get(
-        names=options.names, source=options.source, scenes=options.out or scenes_folder()
-    )
+    cli.call(scene_downloads.get, options, scenes=options.out or scenes_folder())

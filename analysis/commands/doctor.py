@@ -4,7 +4,7 @@ import argparse
 import importlib.util
 import platform
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -134,25 +134,25 @@ def _gpu() -> list[Finding]:
 def _opengl() -> list[Finding]:
     from splatpilot.systems.common.extras import require_opengl
 
-    works = Finding("EGL", "Drake's RenderEngineVtk renders", serves="captures rendered of meshes")
-    return _try(require_opengl, works)
+    works = "Drake's RenderEngineVtk renders"
+    return _try(require_opengl, "EGL", works, "captures rendered of meshes")
 
 
 def _messages() -> list[Finding]:
     from splatpilot.systems.messaging.lcm_ports import DEFAULT_URL, open_lcm
 
     serves = "`splatpilot hardware vehicle`, `bridge` and `px4`"
-    return _try(open_lcm, Finding("messages", f"LCM delivers at {DEFAULT_URL}", serves=serves))
+    return _try(open_lcm, "messages", f"LCM delivers at {DEFAULT_URL}", serves)
 
 
-def _try(call: Callable[[], object], works: Finding) -> list[Finding]:
+def _try(call: Callable[[], object], what: str, works: str, serves: str) -> list[Finding]:
     """Calls a function, whose errors have the problem and, after a semicolon, the remedy."""
     try:
         call()
     except OSError as error:
         found, _, remedy = str(error).partition("; ")
-        return [replace(works, found=found, remedy=remedy)]
-    return [replace(works, serves="")]
+        return [Finding(what, found, remedy, serves)]
+    return [Finding(what, works)]
 
 
 def _video() -> list[Finding]:

@@ -113,10 +113,7 @@ def _hardware_config(options: argparse.Namespace) -> Any:
     "hardware vehicle",
     cli.out_option("output folder", "out/vehicle", unused=True),
     *_MESSAGING,
-    examples=(
-        "hardware vehicle --scenario P02 --policy diffaero",
-        "hardware vehicle --scenario P02 --seed 3 --patience 60 --out out/vehicle_3",
-    ),
+    examples=("hardware vehicle --scenario P02 --seed 3 --patience 60 --out out/vehicle_3",),
 )
 def vehicle(options: argparse.Namespace) -> None:
     """Hovers at the scenario's start until it receives commands, and follows them in real time.
@@ -131,10 +128,7 @@ def vehicle(options: argparse.Namespace) -> None:
     "hardware bridge",
     cli.Option("--log", "write all messages to this file, as lcm-logger does", Path, unused=True),
     *_MESSAGING,
-    examples=(
-        "hardware bridge --scenario P02 --policy diffaero",
-        "hardware bridge --scenario room.yaml --hardware room_hardware.yaml --log flight.lcm",
-    ),
+    examples=("hardware bridge --scenario P02 --hardware hardware.yaml --log flight.lcm",),
 )
 def bridge(options: argparse.Namespace) -> None:
     """Runs policy, controller and failsafe for a vehicle that sends its state and its images, and
@@ -184,10 +178,7 @@ def px4(options: argparse.Namespace) -> None:
         *("trials=30", "seed=1", "scenario.timeout=20"),
         configuration="splatpilot.analysis.faults:FaultsConfig",
     ),
-    examples=(
-        "hardware faults --set trials=30",
-        "hardware faults --out out/faults_1 --set seed=1",
-    ),
+    examples=("hardware faults --out out/faults_1 --set seed=1",),
 )
 def faults(options: argparse.Namespace) -> None:
     """Flies hundreds of short flights through the bridge with lost, late or false messages, clock

@@ -66,7 +66,7 @@ def scale(options: argparse.Namespace) -> None:
     "scene measure",
     cli.path_option("scene", "a scene folder", "scene"),
     cli.OVERWRITE,
-    examples=("scene measure scenes/room_metric", "scene measure scenes/hospital --overwrite"),
+    examples=("scene measure scenes/room_metric",),
 )
 def measure(options: argparse.Namespace) -> None:
     """Writes metrics.json (PSNR, SSIM, LPIPS, depth errors, floaters) and views.png into a scene
@@ -130,10 +130,7 @@ def mesh(options: argparse.Namespace) -> None:
         *("iterations=3000", "image_width=320"),
         configuration="splatpilot.training.reconstruction.config:ReconstructConfig",
     ),
-    examples=(
-        "scene ablate data/hospital --out out/ablation",
-        "scene ablate data/hospital data/office --set iterations=500",
-    ),
+    examples=("scene ablate data/hospital data/office --set iterations=500",),
 )
 def ablate(options: argparse.Namespace) -> None:
     """Extends the paper's ablation: reconstructs each capture as 3DGS and as 2DGS from points, from
@@ -155,10 +152,7 @@ def ablate(options: argparse.Namespace) -> None:
         "max_depth_error=0.03",
         configuration="splatpilot.analysis.reconstruction.fidelity:FidelityConfig",
     ),
-    examples=(
-        "scene fidelity scenes/hospital",
-        "scene fidelity scenes/hospital scenes/warehouse --out out/fidelity",
-    ),
+    examples=("scene fidelity scenes/hospital scenes/warehouse --out out/fidelity",),
 )
 def fidelity(options: argparse.Namespace) -> None:
     """Renders scenes from poses off their captures' paths, compares with the truth or, without it,

@@ -155,10 +155,7 @@ def make_corpus(options: argparse.Namespace) -> None:
     cli.Option("--samples N", "(%(default)s)", int, default=12),
     cli.Option("--seed", "of the choice of samples (%(default)s)", int, default=0),
     cli.OVERWRITE,
-    examples=(
-        "corpus inspect out/corpus --out samples.png",
-        "corpus inspect out/corpus --out samples.png --samples 24 --seed 1 --overwrite",
-    ),
+    examples=("corpus inspect out/corpus --out samples.png --samples 24 --seed 1",),
 )
 def inspect_corpus(options: argparse.Namespace) -> None:
     """Reads a whole corpus, checks every byte of it, and draws some samples: color above depth,
@@ -179,10 +176,7 @@ def inspect_corpus(options: argparse.Namespace) -> None:
     cli.path_option("corpus", "the folder of a corpus"),
     cli.out_option("folder of the dataset", unused=True),
     cli.OVERWRITE,
-    examples=(
-        "corpus export out/corpus --out out/lerobot",
-        "corpus export out/corpus --out out/lerobot --overwrite",
-    ),
+    examples=("corpus export out/corpus --out out/lerobot",),
 )
 def export_corpus(options: argparse.Namespace) -> None:
     """Exports the expert's flights as a LeRobotDataset of version 3.0: parquet files, and videos of
