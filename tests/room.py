@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -34,14 +35,22 @@ def tiled_color(p_N: np.ndarray) -> np.ndarray:
 
 def trace_room(p_N: np.ndarray, R_NB: np.ndarray, width: int, height: int, color_at=room_color):
     """Depth (H, W) [m] along the body's x axis and color (H, W, 3) of the room from inside."""
-    f = width / 2
-    v, u = np.mgrid[0:height, 0:width] + 0.5
-    d_B = np.stack([np.ones_like(u), (u - width / 2) / f, (v - height / 2) / f], axis=-1)
-    d_N = d_B @ R_NB.T
-    with np.errstate(divide="ignore"):
-        to_walls = np.where(d_N > 0, (UPPER_N - p_N) / d_N, (LOWER_N - p_N) / d_N)
-    depth = to_walls.min(axis=-1)
+    K = pinhole(width / 2, width / 2, width / 2, height / 2)
+    d_N = np.dstack([np.ones((height, width)), pinhole_rays(K, width, height)]) @ R_NB.T
+    depth = wall_depth(p_N, d_N, LOWER_N, UPPER_N)
     return depth, color_at(p_N + depth[..., None] * d_N)
+
+
+def pinhole_rays(K: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Rays x/z, y/z (H, W, 2) of the pixels."""
+    v, u = np.mgrid[0:height, 0:width] + 0.5
+    return np.dstack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]])
+
+
+def wall_depth(p: np.ndarray, d: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Lengths (...) of rays d (..., 3) from a point p in a box to its sides."""
+    with np.errstate(divide="ignore"):
+        return (np.where(d > 0, upper - p, p - lower) / np.abs(d)).min(axis=-1)
 
 
 def rotation_from_yaw_pitch(yaw: float, pitch: float) -> tuple[np.ndarray, np.ndarray]:
@@ -104,3 +113,52 @@ def tiled_flight(turn: float = 1.0, aside: float = 1.0) -> Capture:
         images.append((255 * image).astype(np.uint8))
         poses.append(RigidTransform(R_WN @ RotationMatrix(R_NB) @ R_BC, R_WN.multiply(p_N)))
     return Capture("flight", "a flight", K, 320, 240, poses, lambda i: images[i], axes=OPTICAL_AXES)
+
+
+# The same box with z up, in finer waves, seen by a pinhole camera of 64x48 pixels.
+LOWER_W, UPPER_W = np.array([0.0, -1.5, 0.0]), np.array([6.0, 1.5, 2.5])
+K = pinhole(50.0, 52.0, 31.0, 25.0)
+R_LEVEL = RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]))
+CAMERA_POSES = [
+    RigidTransform(
+        RotationMatrix.MakeZRotation(yaw) @ RotationMatrix.MakeYRotation(-pitch) @ R_LEVEL,
+        [1.0 + 0.25 * i, 0.4 * np.sin(i), 1.2 + 0.1 * np.cos(i)],
+    )
+    for i, (yaw, pitch) in enumerate(
+        [(0.0, 0.0), (0.2, -0.2), (0.35, -0.3), (0.5, -0.1), (0.3, 0.1), (0.1, 0.2),
+         (-0.1, 0.0), (-0.3, -0.3), (-0.15, -0.4), (0.05, -0.2)]
+    )
+]  # fmt: skip
+
+
+@dataclass
+class RoomView:
+    X_WC: RigidTransform
+    image: np.ndarray  # (H, W, 3) red, green, blue
+    depth: np.ndarray  # (H, W) [m]
+
+
+def trace(X_WC: RigidTransform, rays: np.ndarray, finer: float = 1.0) -> RoomView:
+    """The room along the rays (H, W, 2) of a camera."""
+    d_C, p_WC = np.dstack([rays, np.ones(rays.shape[:2])]), X_WC.translation()
+    d_W = d_C @ X_WC.rotation().matrix().T
+    depth = wall_depth(p_WC, d_W, LOWER_W, UPPER_W)
+    x, y, z = np.moveaxis(finer * (p_WC + depth[..., None] * d_W), -1, 0)
+    waves = [np.sin(3.1 * x) * np.cos(4 * z + 1), np.cos(5 * y + x), np.sin(2.2 * z + 1.7 * x + y)]
+    return RoomView(X_WC, np.round(127.5 + 90 * np.stack(waves, axis=-1)).astype(np.uint8), depth)
+
+
+def room_views(K, width: int, height: int, poses=CAMERA_POSES, finer: float = 1.0):
+    return [trace(X_WC, pinhole_rays(K, width, height), finer) for X_WC in poses]
+
+
+def assert_shows_room(capture, X_RW=None, color=6.0, depth: float | None = 1e-5) -> None:
+    rays = pinhole_rays(capture.K, capture.width, capture.height)
+    for frame in capture.frames():
+        seen = trace((X_RW or RigidTransform()) @ frame.X_WC, rays)
+        assert frame.image.shape == seen.image.shape
+        assert np.abs(frame.image.astype(float) - seen.image).mean() < color
+        if depth is not None:
+            known = frame.depth > 0
+            assert known.mean() > 0.5
+            assert np.median(np.abs(frame.depth[known] / seen.depth[known] - 1)) < depth

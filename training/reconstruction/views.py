@@ -136,9 +136,8 @@ def learn_background(frames: Sequence[CaptureFrame], photometry: Photometry) -> 
             mean += image[valid].mean(axis=0) / len(frames)
         if not sky.any():
             continue
-        rows, columns = np.nonzero(sky)
         color = frame.image[sky] / (255 * factor[sky])[:, None]
-        v_W = pixel_rays(frame.K, rows, columns, frame.X_WC)
+        v_W = pixel_rays(frame.slopes[sky], frame.X_WC)
         row, column = texel_position(v_W, _HEIGHT, _WIDTH)
         row, column = np.minimum(row.astype(int), _HEIGHT - 1), column.astype(int) % _WIDTH
         np.add.at(sums, row * _WIDTH + column, color)

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
+from room import pinhole_rays
 
 from splatpilot.training.captures import capture, capture_config
 
@@ -31,9 +32,7 @@ K_C = capture.pinhole(52, 52, 32, 24)
 
 
 def plane_depth(n, d, K, width, height):
-    v, u = np.mgrid[0:height, 0:width] + 0.5
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
-    return d / (rays @ n)
+    return d / (pinhole_rays(K, width, height) @ n[:2] + n[2])
 
 
 @pytest.mark.parametrize("finer", [1, 3])

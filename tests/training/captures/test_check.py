@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
-from room import tiled_flight, write_room_capture
+from room import CAMERA_POSES, room_views, tiled_flight, write_room_capture
 
 from splatpilot.analysis.commands.main import main
 from splatpilot.training.captures.capture import (
@@ -30,7 +30,7 @@ NED = RotationMatrix(np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]))
 
 
 @pytest.fixture(scope="module")
-def room(room_views):
+def room():
     views = room_views(K, WIDTH, HEIGHT)
     capture = Capture(
         *("room", "the room", K, WIDTH, HEIGHT, [view.X_WC for view in views]),
@@ -129,11 +129,11 @@ def test_other_errors_are_named(room, change, problem):
     assert re.search(problem, report.problem), str(report)
 
 
-def test_color_and_depth_that_are_not_registered(room, room_views, room_poses):
+def test_color_and_depth_that_are_not_registered(room):
     X_DC = RigidTransform([0.06, 0.02, 0.0])
     K_D, K_C = pinhole(125, 125, 80, 60), pinhole(110, 110, 80, 60)
     colors = room_views(K_C, WIDTH, HEIGHT)
-    depths = room_views(K_D, WIDTH, HEIGHT, [X_WC @ X_DC.inverse() for X_WC in room_poses])
+    depths = room_views(K_D, WIDTH, HEIGHT, [X_WC @ X_DC.inverse() for X_WC in CAMERA_POSES])
     capture = room(
         K=K_D,
         X_WCs=[view.X_WC for view in depths],

@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
+from room import CAMERA_POSES, K, assert_shows_room, room_views, trace
 
 from splatpilot.training.captures import photographs
 from splatpilot.training.captures.capture import Capture, SfmPoints
@@ -23,12 +24,12 @@ X_MW = RigidTransform(
 
 
 @pytest.fixture
-def views(room_views, K):
+def views():
     return room_views(K, 64, 48)
 
 
 @pytest.fixture
-def model(tmp_path, K, views):
+def model(tmp_path, views):
     """A folder of images with a model, whose points are seen by one image each."""
     path, rng = tmp_path / "castle", np.random.default_rng(0)
     model = pycolmap.Reconstruction()
@@ -61,14 +62,14 @@ def lengths(X_WCs) -> np.ndarray:
     return np.linalg.norm(np.diff(p, axis=0), axis=1)
 
 
-def test_model(model, room_poses, shows_room):
+def test_model(model):
     capture = read_capture(model)
     assert not capture.metric and not capture.has_depth and len(capture) == 10
-    np.testing.assert_allclose(lengths(capture.X_WCs), SHRINK * lengths(room_poses), rtol=1e-9)
+    np.testing.assert_allclose(lengths(capture.X_WCs), SHRINK * lengths(CAMERA_POSES), rtol=1e-9)
     capture = read_capture(model, CaptureConfig(scale=ScaleConfig(factor=1 / SHRINK)))
     assert capture.metric
-    X_RW = room_poses[0] @ capture.X_WCs[0].inverse()
-    shows_room(capture, X_RW, color=0.5, depth=None)
+    X_RW = CAMERA_POSES[0] @ capture.X_WCs[0].inverse()
+    assert_shows_room(capture, X_RW, color=0.5, depth=None)
     p_RQ = X_RW.multiply(capture.points.p_WQ.T).T
     to_wall = np.minimum(np.abs(p_RQ - [0, -1.5, 0]), np.abs(p_RQ - [6, 1.5, 2.5])).min(axis=1)
     assert to_wall.max() < 1e-9
@@ -76,17 +77,17 @@ def test_model(model, room_poses, shows_room):
 
 
 @pytest.mark.parametrize(("up", "tilt"), [("cameras", 2.0), ("ground", 0.1)])
-def test_up(model, room_poses, up, tilt):
+def test_up(model, up, tilt):
     capture = read_capture(model, CaptureConfig(up=up))
-    R_RW = (room_poses[0] @ capture.X_WCs[0].inverse()).rotation().matrix()
+    R_RW = (CAMERA_POSES[0] @ capture.X_WCs[0].inverse()).rotation().matrix()
     assert np.rad2deg(np.arccos(R_RW[2, 2])) < tilt
 
 
 @pytest.mark.parametrize("turn", [RotationMatrix.MakeXRotation, RotationMatrix.MakeYRotation])
-def test_height_is_above_a_ground_that_agrees_with_the_cameras(model, turn, room_poses):
-    height = float(np.median([X_WC.translation()[2] for X_WC in room_poses]))
+def test_height_is_above_a_ground_that_agrees_with_the_cameras(model, turn):
+    height = float(np.median([X_WC.translation()[2] for X_WC in CAMERA_POSES]))
     scaled = read_capture(model, CaptureConfig(scale=ScaleConfig(camera_height=height)))
-    np.testing.assert_allclose(lengths(scaled.X_WCs), lengths(room_poses), rtol=1e-3)
+    np.testing.assert_allclose(lengths(scaled.X_WCs), lengths(CAMERA_POSES), rtol=1e-3)
     level = read_capture(model)
     center = np.mean([X_WC.translation() for X_WC in level.X_WCs], axis=0)
     p_SQ = np.random.default_rng(0).uniform([-5, -5, 0], [5, 5, 0], (500, 3))
@@ -100,7 +101,7 @@ def test_height_is_above_a_ground_that_agrees_with_the_cameras(model, turn, room
         camera_height(over_slope(20))
 
 
-def test_distance_between_points(model, room_poses):
+def test_distance_between_points(model):
     reconstruction = pycolmap.Reconstruction(model / "sparse/0")
     points = [list(reconstruction.images[i].points2D)[7] for i in (1, 4)]
     a, b = (reconstruction.points3D[point.point3D_id].xyz for point in points)
@@ -108,17 +109,17 @@ def test_distance_between_points(model, room_poses):
     between = [f"00.png@{u + 0.3:.2f},{v:.2f}", f"03.png@{x + 0.3:.2f},{y:.2f}"]
     scale = ScaleConfig(between=between, distance=float(np.linalg.norm(a - b)) / SHRINK)
     capture = read_capture(model, CaptureConfig(scale=scale))
-    np.testing.assert_allclose(lengths(capture.X_WCs), lengths(room_poses), rtol=1e-9)
+    np.testing.assert_allclose(lengths(capture.X_WCs), lengths(CAMERA_POSES), rtol=1e-9)
 
 
-def test_depth_of_some_images(model, views, room_poses):
+def test_depth_of_some_images(model, views):
     (model / "depth").mkdir()
     for i in (2, 5):
         millimeters = np.round(1000 * views[i].depth).astype(np.uint16)
         cv2.imwrite(str(model / f"depth/{i:02d}.png"), millimeters)
     capture = read_capture(model, CaptureConfig(scale=ScaleConfig(depth_folder="depth")))
     assert capture.metric and capture.has_depth
-    np.testing.assert_allclose(lengths(capture.X_WCs), lengths(room_poses), rtol=0.02)
+    np.testing.assert_allclose(lengths(capture.X_WCs), lengths(CAMERA_POSES), rtol=0.02)
     np.testing.assert_allclose(capture.frame(5).depth, views[5].depth, atol=0.001)
     assert capture.load_depth(0) is None and not capture.frame(0).depth.any()
 
@@ -161,7 +162,7 @@ def test_points_that_only_masked_pixels_show_are_left_out(model):
     assert (times >= 2).all()
 
 
-def test_images_in_subfolders_keep_their_paths(model, views, room_poses):
+def test_images_in_subfolders_keep_their_paths(model, views):
     reconstruction = pycolmap.Reconstruction(model / "sparse/0")
     for image in reconstruction.images.values():
         i = image.image_id - 1
@@ -176,9 +177,9 @@ def test_images_in_subfolders_keep_their_paths(model, views, room_poses):
         scale = ScaleConfig(between=list(between), distance=distance)
         return read_capture(model, CaptureConfig(scale=scale))
 
-    baseline = np.linalg.norm(room_poses[0].translation() - room_poses[5].translation())
+    baseline = np.linalg.norm(CAMERA_POSES[0].translation() - CAMERA_POSES[5].translation())
     found = scaled("cam0/00.png", "cam1/00.png", distance=float(baseline))
-    np.testing.assert_allclose(lengths(found.X_WCs), lengths(room_poses), rtol=1e-9)
+    np.testing.assert_allclose(lengths(found.X_WCs), lengths(CAMERA_POSES), rtol=1e-9)
     u, v = reconstruction.images[6].points2D[7].xy
     assert scaled(f"cam1/00.png@{u},{v}", "cam0/01.png").metric
     with pytest.raises(ValueError, match=r"several .* called '00.png'; choose one of cam0/00.png"):
@@ -208,7 +209,7 @@ def test_invalid_scale_is_refused(model, scale, message):
         read_capture(model, CaptureConfig(scale=ScaleConfig(**scale)))
 
 
-def test_distorted_model(model, shows_room, room_poses, trace_rays):
+def test_distorted_model(model):
     reconstruction = pycolmap.Reconstruction(model / "sparse/0")
     camera = reconstruction.cameras[1]
     camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
@@ -216,11 +217,11 @@ def test_distorted_model(model, shows_room, room_poses, trace_rays):
     reconstruction.write(model / "sparse/0")
     pixels = np.stack(np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5), axis=-1)
     rays = camera.cam_from_img(pixels.reshape(-1, 2)).reshape(48, 64, 2)
-    for i, X_WC in enumerate(room_poses):
-        image = trace_rays(X_WC, rays).image
+    for i, X_WC in enumerate(CAMERA_POSES):
+        image = trace(X_WC, rays).image
         cv2.imwrite(str(model / f"images/{i:02d}.png"), image[..., ::-1])
     capture = read_capture(model, CaptureConfig(scale=ScaleConfig(factor=1 / SHRINK)))
-    shows_room(capture, room_poses[0] @ capture.X_WCs[0].inverse(), color=3.0, depth=None)
+    assert_shows_room(capture, CAMERA_POSES[0] @ capture.X_WCs[0].inverse(), color=3.0, depth=None)
 
 
 def test_missing_and_damaged_parts_are_refused(model):

@@ -4,16 +4,12 @@ import cv2
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
+from room import CAMERA_POSES, K, assert_shows_room, pinhole_rays, room_views, trace
 
 from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
 from splatpilot.training.captures.capture_registry import read_capture
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def pinhole_rays(K):
-    v, u = np.mgrid[0:48, 0:64] + 0.5
-    return np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1)
 
 
 def change(path, **keys):
@@ -29,12 +25,12 @@ def change(path, **keys):
 
 
 @pytest.fixture
-def write(tmp_path, K, room_poses, trace_rays):
+def write(tmp_path):
     def write(rays=None, depth=True, **extra):
-        rays = pinhole_rays(K) if rays is None else rays
+        rays = pinhole_rays(K, 64, 48) if rays is None else rays
         frames = []
-        for i, X_WC in enumerate(room_poses):
-            view, matrix = trace_rays(X_WC, rays), (X_WC.GetAsMatrix4() @ OPENGL).tolist()
+        for i, X_WC in enumerate(CAMERA_POSES):
+            view, matrix = trace(X_WC, rays), (X_WC.GetAsMatrix4() @ OPENGL).tolist()
             cv2.imwrite(str(tmp_path / f"{i:02d}.png"), view.image[..., ::-1])
             frames.append({"file_path": f"./{i:02d}.png", "transform_matrix": matrix})
             if depth:
@@ -48,13 +44,13 @@ def write(tmp_path, K, room_poses, trace_rays):
     return write
 
 
-def test_room(write, shows_room):
+def test_room(write):
     capture = read_capture(write())
     assert capture.metric and capture.depth_camera is None
-    shows_room(capture, color=0.5)
+    assert_shows_room(capture, color=0.5)
 
 
-def test_each_frame_may_have_its_camera(write, K, shows_room):
+def test_each_frame_may_have_its_camera(write):
     path = write()
     change(path, frame_3={"cx": K[0, 2] + 4, "cy": K[1, 2] + 4})
     image = cv2.imread(str(path / "03.png"))
@@ -64,16 +60,16 @@ def test_each_frame_may_have_its_camera(write, K, shows_room):
     np.save(path / "03.npy", cv2.warpAffine(depth, shift, (64, 48)))
     capture = read_capture(path)
     assert not capture.dropped and capture.K[0, 0] > 50
-    shows_room(capture, color=4.0, depth=0.02)
+    assert_shows_room(capture, color=4.0, depth=0.02)
 
 
-def test_depth_may_be_smaller_but_not_of_another_view(write, shows_room, room_views, K):
+def test_depth_may_be_smaller_but_not_of_another_view(write):
     path = write()
     for i, view in enumerate(room_views(np.diag([0.5, 0.5, 1]) @ K, 32, 24)):
         np.save(path / f"{i:02d}.npy", (1000 * view.depth).astype(np.float32))
     capture = read_capture(path)
     assert capture.frame(0).depth.shape == (48, 64)
-    shows_room(capture, color=0.5, depth=0.03)
+    assert_shows_room(capture, color=0.5, depth=0.03)
     for i in range(10):
         np.save(path / f"{i:02d}.npy", np.ones((24, 24), np.float32))
     with pytest.raises(ValueError, match="24x24 pixels of depth do not show what 64x48 pixels"):
@@ -136,8 +132,8 @@ def test_split_and_flags_of_the_files_are_kept(write, keys, held_out, frames):
 
 @pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_RADIAL"])
 @pytest.mark.parametrize("k", [(0.02, -0.01, 0.005, 0.4, 0, 0), (-0.15, 0.03, 0, 0, 0.002, -0.001)])
-def test_distortion_is_taken_out(write, K, shows_room, trace_rays, model, k):
-    bent = rays = pinhole_rays(K)
+def test_distortion_is_taken_out(write, model, k):
+    bent = rays = pinhole_rays(K, 64, 48)
     for _ in range(50):
         x, y = rays[..., :1], rays[..., 1:]
         r2 = x**2 + y**2
@@ -149,17 +145,17 @@ def test_distortion_is_taken_out(write, K, shows_room, trace_rays, model, k):
     named = read_capture(path)
     listed = change(path, **dict.fromkeys(names, 0), distortion_params=k)
     for capture in (named, read_capture(listed)):
-        shows_room(capture, color=3.0, depth=0.02)
+        assert_shows_room(capture, color=3.0, depth=0.02)
         frame = capture.frame(0)
-        seen = trace_rays(frame.X_WC, pinhole_rays(capture.K)[:6, :6])
+        seen = trace(frame.X_WC, pinhole_rays(capture.K, 64, 48)[:6, :6])
         np.testing.assert_allclose(frame.depth[:6, :6], seen.depth, rtol=0.03)
 
 
-def test_fisheye_is_taken_out_and_cropped_to_its_radius(write, K, shows_room):
-    bent = pinhole_rays(K)
+def test_fisheye_is_taken_out_and_cropped_to_its_radius(write):
+    bent = pinhole_rays(K, 64, 48)
     theta = np.linalg.norm(bent, axis=-1, keepdims=True)
     path = write(bent * np.tan(theta) / theta, camera_model="OPENCV_FISHEYE")
-    shows_room(read_capture(path), color=3.0, depth=0.02)
+    assert_shows_room(read_capture(path), color=3.0, depth=0.02)
     image = np.zeros((48, 64, 3), np.uint8)
     v, u = np.mgrid[0:48, 0:64] + 0.5
     image[np.hypot(u - 32, v - 24) < 21] = 90

@@ -5,6 +5,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
+from room import CAMERA_POSES, K, assert_shows_room, room_views
 
 from splatpilot.training.captures.capture_registry import read_capture
 
@@ -14,7 +15,7 @@ X_RF = RigidTransform(RotationMatrix.MakeXRotation(np.pi / 2))
 
 
 @pytest.fixture
-def write(tmp_path, K, room_views):
+def write(tmp_path):
     def write(prefix: str = ""):
         folder = tmp_path / "keyframes"
         for name in (f"{prefix}images", f"{prefix}cameras", "depth"):
@@ -40,7 +41,7 @@ def write(tmp_path, K, room_views):
 
 
 @pytest.mark.parametrize("prefix", ["", "corrected_"])
-def test_room(write, shows_room, prefix):
+def test_room(write, prefix):
     path = write(prefix)
     (path / "keyframes/cameras").mkdir(exist_ok=True)
     if prefix:
@@ -52,7 +53,7 @@ def test_room(write, shows_room, prefix):
             camera.write_text(json.dumps(values))
     capture = read_capture(path)
     assert capture.source.startswith("Polycam") and capture.metric
-    shows_room(capture, color=4.0, depth=0.03)
+    assert_shows_room(capture, color=4.0, depth=0.03)
     dropped = "3 of 13 keyframes have no corrected camera" if prefix else ""
     assert len(capture.dropped) == bool(prefix) and dropped in "".join(capture.dropped)
 
@@ -79,7 +80,7 @@ def test_damaged_keyframes_are_named_and_depth_without_confidence_is_unknown(wri
 
 
 @pytest.fixture
-def write_record3d(tmp_path, K, room_views):
+def write_record3d(tmp_path):
     def write_record3d(**extra):
         (tmp_path / "rgb").mkdir()
         (tmp_path / "depth").mkdir()
@@ -103,14 +104,14 @@ def write_record3d(tmp_path, K, room_views):
 
 
 @pytest.mark.parametrize("per_frame", [False, True])
-def test_record3d_room(write_record3d, K, shows_room, room_poses, per_frame):
+def test_record3d_room(write_record3d, per_frame):
     own = [[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]] * 10
     wrong = (np.diag([2.0, 2.0, 1]) @ K).T.ravel().tolist()
     intrinsics = {"K": wrong, "perFrameIntrinsicCoeffs": own} if per_frame else {}
     capture = read_capture(write_record3d(**intrinsics))
     assert capture.source.startswith("Record3D") and capture.metric and not capture.dropped
-    X_RW = room_poses[0] @ capture.X_WCs[0].inverse()
-    shows_room(capture, X_RW, color=0.5, depth=0.03)
+    X_RW = CAMERA_POSES[0] @ capture.X_WCs[0].inverse()
+    assert_shows_room(capture, X_RW, color=0.5, depth=0.03)
     assert X_RW.rotation().matrix()[2, 2] > np.cos(np.deg2rad(15))
 
 

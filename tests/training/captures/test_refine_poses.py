@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
+from room import CAMERA_POSES, room_views
 from scipy.spatial.transform import Rotation
 
 from splatpilot.training.captures import refine_poses as module
@@ -17,7 +18,7 @@ K = pinhole(300.0, 304.0, 162.0, 118.0)
 
 
 @pytest.fixture
-def frames(room_views):
+def frames():
     def views(poses, noise: float = 0.0, exposure: float = 1.0) -> list[ComparedFrame]:
         rng = np.random.default_rng(5)
         prepared = []
@@ -55,8 +56,8 @@ def errors(poses: list[RigidTransform], truth: list[RigidTransform]) -> np.ndarr
     )
 
 
-def test_derivatives(frames, room_poses):
-    given = room_poses[5:7]
+def test_derivatives(frames):
+    given = CAMERA_POSES[5:7]
     seen, h = frames(given), 1e-4
     for number in range(12):
 
@@ -91,19 +92,19 @@ def test_edges_and_holes_are_not_compared():
 
 
 @pytest.mark.parametrize(("noise", "left"), [(0.0, 0.1), (0.005, 0.3)])
-def test_drift_is_removed(frames, room_poses, noise, left):
-    given = drifting(room_poses, 0.02, 0.02)
-    refined = refine_poses(frames(room_poses, noise, exposure=0.97), given)
-    assert (errors(refined.X_WCs, room_poses) < left * errors(given, room_poses)).all()
+def test_drift_is_removed(frames, noise, left):
+    given = drifting(CAMERA_POSES, 0.02, 0.02)
+    refined = refine_poses(frames(CAMERA_POSES, noise, exposure=0.97), given)
+    assert (errors(refined.X_WCs, CAMERA_POSES) < left * errors(given, CAMERA_POSES)).all()
     assert refined.contrast[1] < refined.contrast[0]
     assert refined.depth[1] < refined.depth[0]
     assert refined.moved > 0.001
     assert "poses moved by" in str(refined)
 
 
-def test_blind_frame_moves_with_its_neighbors(frames, room_poses):
-    given = drifting(room_poses, 0.02, 0.02)
-    seen = frames(room_poses)
+def test_blind_frame_moves_with_its_neighbors(frames):
+    given = drifting(CAMERA_POSES, 0.02, 0.02)
+    seen = frames(CAMERA_POSES)
     blind = CaptureFrame(
         np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32), given[5], K
     )
@@ -112,12 +113,12 @@ def test_blind_frame_moves_with_its_neighbors(frames, room_poses):
     before, own, after = (refined[i].translation() - given[i].translation() for i in (4, 5, 6))
     np.testing.assert_allclose(own, (before + after) / 2, atol=1e-3)
     others = [i for i in range(len(given)) if i != 5]
-    left = errors([refined[i] for i in others], [room_poses[i] for i in others])
-    assert (left < 0.1 * errors(given, room_poses)).all()
+    left = errors([refined[i] for i in others], [CAMERA_POSES[i] for i in others])
+    assert (left < 0.1 * errors(given, CAMERA_POSES)).all()
 
 
 @pytest.fixture
-def folder(tmp_path, room_views, room_poses) -> Path:
+def folder(tmp_path) -> Path:
     path = tmp_path / "capture"
     path.mkdir()
     (path / "capture.yaml").write_text(
@@ -129,14 +130,14 @@ def folder(tmp_path, room_views, room_poses) -> Path:
         cv2.imwrite(f"{stem}.color.png", view.image[..., ::-1])
         cv2.imwrite(f"{stem}.depth.png", np.round(1000 * view.depth).astype(np.uint16))
         off = RigidTransform([0.01 * np.sin(2 * i), 0, 0])
-        np.savetxt(f"{stem}.pose.txt", (off @ room_poses[i]).GetAsMatrix4())
+        np.savetxt(f"{stem}.pose.txt", (off @ CAMERA_POSES[i]).GetAsMatrix4())
     return path
 
 
-def test_poses_are_refined_once(folder, room_poses, monkeypatch, capfd):
+def test_poses_are_refined_once(folder, monkeypatch, capfd):
     capture = read_capture(folder)
     assert "poses moved by" in capfd.readouterr().err
-    assert errors(capture.X_WCs, room_poses)[1] < 0.003  # of 0.012
+    assert errors(capture.X_WCs, CAMERA_POSES)[1] < 0.003  # of 0.012
     monkeypatch.setattr(module, "refine_poses", None)
     again = read_capture(folder)
     for X_WC, same in zip(capture.X_WCs, again.X_WCs, strict=True):
@@ -168,6 +169,6 @@ def test_without_depth(tmp_path):
     assert not (tmp_path / "cache").exists()
 
 
-def test_exact_poses_stay(frames, room_poses):
-    refined = refine_poses(frames(room_poses), room_poses)
-    assert (errors(refined.X_WCs, room_poses) < 1e-3).all()
+def test_exact_poses_stay(frames):
+    refined = refine_poses(frames(CAMERA_POSES), CAMERA_POSES)
+    assert (errors(refined.X_WCs, CAMERA_POSES) < 1e-3).all()

@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from room import wall_depth
 
 from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.flight.scenario import Scenario
@@ -16,6 +17,7 @@ from splatpilot.diagrams.worlds.splits import source_digest
 from splatpilot.diagrams.worlds.world_registry import make_spec
 from splatpilot.systems.common.config import load_config
 from splatpilot.training.captures import render as render_capture
+from splatpilot.training.captures.capture import pixel_rays
 from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.captures.render import RenderConfig, rendered_world, run, true_camera
 from splatpilot.training.reconstruction.config import ReconstructConfig
@@ -39,13 +41,8 @@ def small(**fields) -> RenderConfig:
 
 
 def depth_of_room(frame) -> np.ndarray:
-    height, width = frame.depth.shape
-    v, u = np.mgrid[:height, :width] + 0.5
-    rays = frame.back_project(u, v, np.ones_like(u)) @ frame.X_WC.rotation().matrix().T
-    p_WC = frame.X_WC.translation()
-    with np.errstate(divide="ignore"):
-        walls = np.where(rays > 0, (SIZE / 2 - p_WC) / rays, (-SIZE / 2 - p_WC) / rays)
-    return walls.min(axis=-1)
+    rays = pixel_rays(frame.K, 64, 48) @ frame.X_WC.rotation().matrix().T
+    return wall_depth(frame.X_WC.translation(), rays, -SIZE / 2, SIZE / 2)
 
 
 def test_a_world_may_be_named_as_in_the_benchmark(tmp_path, monkeypatch, capsys):

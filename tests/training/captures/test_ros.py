@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
+from room import K, assert_shows_room, room_views
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -135,7 +136,7 @@ class Bag:
 
 
 @pytest.fixture
-def bag(tmp_path, K, room_views):
+def bag(tmp_path):
     return lambda version: Bag(tmp_path, version, K, room_views(K, 64, 48))
 
 
@@ -154,10 +155,10 @@ def config(tmp_path):
         ("odometry", {"compressed": True, "depth32": True}),
     ],
 )
-def test_room(bag, config, shows_room, version, poses, images):
+def test_room(bag, config, version, poses, images):
     capture = read_capture(bag(version).room(poses=poses, **images), config())
     assert capture.source.startswith("ROS bag") and len(capture) == 10 and not capture.dropped
-    shows_room(capture, color=0.5, depth=0.01 if images else 0.002)
+    assert_shows_room(capture, color=0.5, depth=0.01 if images else 0.002)
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -171,15 +172,13 @@ def test_room(bag, config, shows_room, version, poses, images):
          "from /camera/color/camera_info"),
     ],
 )  # fmt: skip
-def test_calibration_is_in_the_namespace_of_the_images(
-    bag, config, shows_room, compressed, calibrations, color, note
-):
+def test_calibration_is_of_the_images(bag, config, compressed, calibrations, color, note):
     recorded = bag(1)
     path = recorded.room(calibrations, compressed=compressed, color=color)
     capture = read_capture(path, config())
     np.testing.assert_allclose(capture.K, recorded.K)
     assert capture.notes[0].endswith(note)
-    shows_room(capture, color=0.5, depth=0.01)
+    assert_shows_room(capture, color=0.5, depth=0.01)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +196,7 @@ def test_intrinsics_replace_an_ambiguous_or_unknown_calibration(bag, config, cal
     assert read_capture(path, config(intrinsics=[50, 52, 31, 25])).K[0, 0] == 50
 
 
-def test_the_bag_is_read_once(bag, config, shows_room):
+def test_the_bag_is_read_once(bag, config):
     recorded = bag(2)
     path = recorded.room((), depth32=True)
     with pytest.raises(ValueError, match=r"has no calibration of the color camera.*intrinsics"):
@@ -208,7 +207,7 @@ def test_the_bag_is_read_once(bag, config, shows_room):
     os.utime(database, ns=(times.st_atime_ns, times.st_mtime_ns))
     K = recorded.K
     capture = read_capture(path, config(intrinsics=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
-    shows_room(capture, color=0.5, depth=0.002)
+    assert_shows_room(capture, color=0.5, depth=0.002)
 
 
 def test_missing_parts_are_named(bag, config, tmp_path):

@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform
+from room import CAMERA_POSES, K, assert_shows_room, room_views
 
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture
@@ -14,10 +15,10 @@ K_D = np.array([[55.0, 0, 32], [0, 55.0, 24], [0, 0, 1]])
 
 
 @pytest.fixture
-def path(tmp_path, K, room_views, room_poses) -> Path:
+def path(tmp_path) -> Path:
     X_DC = RigidTransform(np.array(P_DC))
     colors = room_views(K, 64, 48)
-    depths = room_views(K_D, 64, 48, [X_WC @ X_DC.inverse() for X_WC in room_poses])
+    depths = room_views(K_D, 64, 48, [X_WC @ X_DC.inverse() for X_WC in CAMERA_POSES])
     for i in range(10):
         stem = str(tmp_path / f"frame-{10 * i:06d}")
         cv2.imwrite(f"{stem}.color.png", colors[i].image[..., ::-1])
@@ -35,10 +36,10 @@ def config():
     return lambda **changes: CaptureConfig(**{"p_DC": P_DC, "up": "z"} | fields | changes)
 
 
-def test_frames_of_two_cameras(path, config, shows_room):
+def test_frames_of_two_cameras(path, config):
     capture = read_capture(path, config())
     assert capture.depth_camera is not None and len(capture) == 10 and not capture.dropped
-    shows_room(capture, color=0.5, depth=0.01)
+    assert_shows_room(capture, color=0.5, depth=0.01)
     depth = capture.load_depth(0)
     assert not depth[0, :2].any() and (depth[1:] > 0).all() and depth.max() < 10
     twice = read_capture(path, config(depth_unit=500)).load_depth(0)
@@ -104,7 +105,7 @@ K_D_SCANNET = np.array([[24.0, 0, 16], [0, 24.0, 12], [0, 0, 1]])
 
 
 @pytest.fixture
-def scannet(tmp_path, K, room_views):
+def scannet(tmp_path):
     for name in ("color", "depth", "pose", "intrinsic"):
         (tmp_path / name).mkdir()
     colors, depths = room_views(K, 64, 48), room_views(K_D_SCANNET, 32, 24)
@@ -121,13 +122,13 @@ def scannet(tmp_path, K, room_views):
     return tmp_path
 
 
-def test_room(scannet, shows_room):
+def test_room(scannet):
     capture = read_capture(scannet)
     assert capture.source.startswith("ScanNet") and not capture.dropped
-    shows_room(capture, color=0.5, depth=0.03)
+    assert_shows_room(capture, color=0.5, depth=0.03)
 
 
-def test_intrinsics_of_larger_images_are_refused(scannet, K):
+def test_intrinsics_of_larger_images_are_refused(scannet):
     matrix = np.eye(4)
     matrix[:2, :3] = [[117.019, 0, 64.275], [0, 117.019, 47.875]]
     np.savetxt(scannet / "intrinsic/intrinsic_color.txt", matrix)

@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from room import assert_shows_room, room_views
 
 from splatpilot.training.captures.capture_registry import read_capture
 
@@ -8,7 +9,7 @@ FX, CX = 525.0, 320.0
 
 
 @pytest.fixture
-def sequence(tmp_path, room_views):
+def sequence(tmp_path):
     K = np.array([[FX, 0, CX], [0, FX, 240.0], [0, 0, 1]]) * [[1 / 8], [1 / 8], [1]]
     (tmp_path / "rgb").mkdir()
     (tmp_path / "depth").mkdir()
@@ -31,10 +32,10 @@ def sequence(tmp_path, room_views):
     return tmp_path
 
 
-def test_room(sequence, shows_room):
+def test_room(sequence):
     capture = read_capture(sequence)
     assert len(capture) == 10 and not capture.dropped
-    shows_room(capture, color=0.5, depth=0.001)
+    assert_shows_room(capture, color=0.5, depth=0.001)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +92,7 @@ def test_bad_lists(sequence, name, text, message):
         read_capture(sequence)
 
 
-def test_images_without_depth_or_pose_are_left_out(sequence, shows_room):
+def test_images_without_depth_or_pose_are_left_out(sequence):
     lines = (sequence / "depth.txt").read_text().splitlines()
     (sequence / "depth.txt").write_text("\n".join(lines[:-1]))
     rows = np.loadtxt(sequence / "groundtruth.txt").reshape(10, 2, 8).mean(axis=1)
@@ -100,7 +101,7 @@ def test_images_without_depth_or_pose_are_left_out(sequence, shows_room):
     assert len(capture) == 3
     assert "7 of 10 color images have no depth within 0.02 s" in capture.dropped[0]
     assert list(capture.frame_names) == [f"{100 + i / 30:.6f}.png" for i in (0, 4, 8)]
-    shows_room(capture, color=0.5, depth=0.001)
+    assert_shows_room(capture, color=0.5, depth=0.001)
 
 
 def test_times_in_nanoseconds_with_a_byte_order_mark(sequence):
