@@ -2,7 +2,6 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
-from functools import partial
 
 import av
 import gymnasium
@@ -50,28 +49,26 @@ def test_checkers_pass_without_warnings(observation, post_world):
         check_env_of_sb3(env)
 
 
-def test_delayed_decisions_come_late_in_both_environments(post_world):
-    def moved(make, action, axis, **fields):
+@pytest.mark.parametrize(("action", "axis", "delay"), [("velocity", 0, 0.06), ("command", 2, 0.05)])
+def test_delayed_decisions_come_late_in_both_environments(action, axis, delay, post_world):
+    def moved(make, **fields):
         scenario = Scenario(start_radius=0.0, **fields)
-        env = make(scenario, world=post_world, observation="full_state", action=action)
+        env = make(scenario=scenario, world=post_world, observation="full_state", action=action)
         start = env.reset(seed=0)[0]
         ahead = np.zeros(env.action_space.shape)
         ahead[..., 0] = 1.0
         return [(env.step(ahead)[0] - start)[..., axis].item() for _ in range(3)]
 
-    for action, axis, delay in (("velocity", 0, 0.06), ("command", 2, 0.05)):
-        late = moved(FlightEnv, action, axis, decision_delay=[delay, delay])
-        assert 0 < late[0] < 0.5 * moved(FlightEnv, action, axis)[0]
-        many = moved(partial(VectorFlightEnv, 1), action, axis, decision_delay=[delay, delay])
-        np.testing.assert_allclose(late, many, atol=1e-5)
+    late = moved(FlightEnv, decision_delay=[delay, delay])
+    assert 0 < late[0] < 0.5 * moved(FlightEnv)[0]
+    many = moved(VectorFlightEnv, decision_delay=[delay, delay])
+    np.testing.assert_allclose(late, many, atol=1e-5)
 
 
 def test_drawn_fields_are_those_of_the_flight(post_world):
     scenario = Scenario(timeout=Uniform(0.1, 0.3), appearance=Uniform(0.5, 1.0))  # pyright: ignore
-    for env in (
-        FlightEnv(scenario, world=post_world),
-        VectorFlightEnv(1, scenario, world=post_world),
-    ):
+    for make in (FlightEnv, VectorFlightEnv):
+        env = make(scenario=scenario, world=post_world)
         env.reset(seed=0)
         action, steps = np.zeros(env.action_space.shape), 0
         while not np.any(env.step(action)[3]):
@@ -142,14 +139,15 @@ def test_the_policy_sees_and_acts_by_the_estimate(post_world):
 def test_flights_end_by_name_and_keep_the_diagram(post_world):
     env = FlightEnv(Scenario(timeout=4.0), world=post_world)
     diagram, simulator = env.diagram, env.simulator
-    *_, info = flown(env, 0)
-    assert info == {"outcome": "collision", "is_success": False}
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        env.step(AHEAD)
-    *_, info = flown(env, 0, goal=[2.5, 0.0, 2.0])
-    assert info == {"outcome": "goal", "is_success": True}
-    *_, info = flown(env, 0, start=[1.0, 2.0, 2.0], goal=[9.0, 2.0, 2.0])
-    assert info == {"outcome": "timeout", "is_success": False}
+    for options, outcome in (
+        ({}, "collision"),
+        ({"goal": [2.5, 0.0, 2.0]}, "goal"),
+        ({"start": [1.0, 2.0, 2.0], "goal": [9.0, 2.0, 2.0]}, "timeout"),
+    ):
+        *_, info = flown(env, 0, **options)
+        assert info == {"outcome": outcome, "is_success": outcome == "goal"}
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.step(AHEAD)
     env.reset(options={"goal": [1.0, 2.0, 2.0]})
     assert env.diagram is diagram and env.simulator is simulator
     assert env.simulator.get_context().get_time() == 0.0

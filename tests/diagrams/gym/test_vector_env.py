@@ -205,15 +205,14 @@ def test_flights_repeat_with_any_threads_and_simd_level(post_world, monkeypatch)
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 def test_autoreset_modes(mode, post_world):
-    scenario = Scenario(timeout=0.4, start_radius=0.0)
+    scenario = Scenario(timeout=0.2, start_radius=0.0)
     options = {"observation": "full_state", "autoreset_mode": mode}
     envs = VectorFlightEnv(3, scenario, world=post_world, **options)
     assert envs.metadata["autoreset_mode"].value == mode
     start, _ = envs.reset(seed=0)
     ahead = np.tile([1.0, 0.0, 0.0], (3, 1))
-    for _ in range(3):
-        *_, truncated, infos = envs.step(ahead)
-        assert not truncated.any() and not infos
+    *_, truncated, infos = envs.step(ahead)
+    assert not truncated.any() and not infos
     observed, _, _, truncated, infos = envs.step(ahead)
     assert truncated.all()
     assert infos.get("final_info", infos)["outcome"].tolist() == ["timeout"] * 3
@@ -340,10 +339,8 @@ def test_seeds_and_scenarios_of_flights_are_known(post_world):
             {"scenario": Scenario(imaging=Imaging(vignetting=1.0)), "observation": "rgb"},
             "imaging of VectorFlightEnv must be left out",
         ),
-        ({"observation": ["imu_gyro"]}, "observation must be one of state"),
         ({"num_envs": 0}, "num_envs must be at least 1"),
         ({"render_mode": "human"}, "render_mode must be rgb_array or None"),
-        ({"speed": 2.0}, "there is no argument .speed."),
     ],
 )
 def test_invalid_arguments_are_errors(fields, message, post_world):
@@ -365,13 +362,10 @@ def test_invalid_steps_and_resets_are_errors(post_world):
     for actions in (np.full((2, 3), np.nan), np.full((2, 3), 1.1), np.zeros(3)):
         with pytest.raises(ValueError, match="action must be"):
             envs.step(actions)
-    for options, message in (
-        ({"reset_mask": [True]}, "reset_mask must be"),
-        ({"flight": 64}, "flight must be in"),
-        ({"world": 1}, "options must be of reset_mask"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            envs.reset(options=options)
+    invalid = {"reset_mask": [True], "flight": 64, "options": 1}
+    for name, value in invalid.items():
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            envs.reset(options={name: value})
     envs.config.reward = lambda transition: 1.0
     with pytest.raises(ValueError, match=r"shape of the rewards must be \(2,\)"):
         envs.step(np.zeros((2, 3)))

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform
+from room import pinhole_rays, wall_depth
 
 from splatpilot.systems.splats.scene import GaussianScene
 
@@ -20,25 +21,21 @@ class BoxRoom:
             for end in (0.0, length):
                 grids = [np.array([end]) if a == axis else axes[a] for a in range(3)]
                 sides.append(np.stack(np.meshgrid(*grids, indexing="ij"), -1).reshape(-1, 3))
-        means = np.concatenate(sides)
-        N = len(means)
+        N = len(means := np.concatenate(sides))
         quats, scales = np.tile([1, 0, 0, 0], (N, 1)), np.full((N, 3), scale * step)
-        return GaussianScene.from_colors(
-            means, quats, scales, np.full(N, 0.99), np.full((N, 3), 0.3)
-        )
+        looks = np.full(N, 0.99), np.full((N, 3), 0.3)
+        return GaussianScene.from_colors(means, quats, scales, *looks)
 
     @staticmethod
     def rays(X_WC: RigidTransform) -> np.ndarray:
         """(120, 160, 3) of depth 1, in W."""
-        x, y = np.meshgrid((np.arange(160) - 79.5) / 80.0, (np.arange(120) - 59.5) / 80.0)
-        return np.stack([x, y, np.ones_like(x)], -1) @ X_WC.rotation().matrix().T
+        rays_C = np.dstack([pinhole_rays(BoxRoom.K, 160, 120), np.ones((120, 160))])
+        return rays_C @ X_WC.rotation().matrix().T
 
     def depth(self, X_WC: RigidTransform) -> np.ndarray:
         """(120, 160) [m] to the walls."""
-        p_WC, rays = X_WC.translation(), self.rays(X_WC)
-        with np.errstate(divide="ignore"):
-            ends = [(end - p_WC) / rays for end in (np.zeros(3), self.size)]
-        return np.maximum(*ends).min(axis=-1).astype(np.float32)
+        depth = wall_depth(X_WC.translation(), self.rays(X_WC), np.zeros(3), self.size)
+        return depth.astype(np.float32)
 
 
 @pytest.fixture(scope="session")

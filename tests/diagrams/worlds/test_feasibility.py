@@ -47,7 +47,7 @@ def test_unknown_space_is_not_flown_through():
 
 def test_narrow_corridors_get_less_margin():
     esdf = corridors(((0.2, 0.2, 0.2), (5.8, 1.3, 1.3)))
-    p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, margin=0.2)
+    p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS)
     assert length > 3
     assert (esdf.conservative().distance(np.array([p_WS, p_WG])) > RADIUS + 0.1).all()
     times = time_of_arrival(esdf.conservative(), p_WG, LatticeConfig().margin)
@@ -59,18 +59,16 @@ def test_the_longer_route_is_chosen_not_the_larger_part():
     corridor = ((4.0, 0.2, 0.2), (5.3, 9.8, 1.5))
     esdf = corridors(hall, corridor, size=(60, 100, 40))
     for seed in (None, 0):
-        p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, margin=0.2, seed=seed)
-        assert min(p_WS[0], p_WG[0]) > 4.0
-        assert length > 4.0
+        p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, seed=seed)
+        assert min(p_WS[0], p_WG[0], length) > 4.0
 
 
 def test_half_of_the_margin_is_taken_for_a_much_longer_route():
     rooms = [((x, 0.2, 0.2), (x + 1.8, 2.0, 2.0)) for x in (0.2, 4.0, 7.8)]
     doors = [((x, 0.6, 0.6), (x + 2.0, 1.7, 1.7)) for x in (2.0, 5.8)]
     esdf = corridors(*rooms, *doors, size=(100, 22, 22))
-    _, _, length = choose_start_and_goal(esdf, RADIUS, margin=0.2)
-    assert length > 8.0
-    assert not short_route_warning(length)
+    _, _, length = choose_start_and_goal(esdf, RADIUS)
+    assert length > 8.0 and not short_route_warning(length)
     assert "5.0 m" in short_route_warning(5.0)
 
 

@@ -41,16 +41,14 @@ def sphere_depth(rays_W, p_WC, forward, centers, radii) -> np.ndarray:
 def test_spheres_are_seen_where_they_are_hit(course, time):
     config = OnboardCamera(width=96, height=72)
     camera = make_onboard_camera(config, course)
-    centers, radii, moves = [], [], []
+    seen = []
     for obstacle in dodgedrone.draw_obstacles(dodgedrone.LEVELS["easy"], dodgedrone.SEED + 1):
         last = len(obstacle.path) - 1
         row = round(time / 0.02) % max(2 * last, 1)
         center = obstacle.path[min(row, 2 * last - row)]
         if np.isfinite(center).all():
-            centers.append(center)
-            radii.append(obstacle.radius)
-            moves.append(last > 0)
-    centers, radii = np.array(centers), np.array(radii)
+            seen.append((center, obstacle.radius, last > 0))
+    centers, radii, moves = map(np.array, zip(*seen, strict=True))
     assert sum(moves) >= 5
     wrong, pixels = 0, 0
     for sphere in np.flatnonzero(moves):
