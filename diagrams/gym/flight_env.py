@@ -83,7 +83,6 @@ class FlightEnv(gymnasium.Env):
 
     Raises:
         InfeasibleFlightError: also by `reset`, for a world, start or goal that cannot be flown.
-        ValueError: for invalid arguments, and by `step` for invalid actions.
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012

@@ -28,8 +28,7 @@ def _add(registration: ModuleType) -> None:
 
 
 class _Finder(MetaPathFinder):
-    """Registers once Gymnasium has been imported, as `make("splatpilot:Flight-v0")` may come after
-    an `import splatpilot` that came before Gymnasium's."""
+    """Registers once Gymnasium has been imported, which may be after `import splatpilot`."""
 
     def find_spec(self, fullname: str, path: Any, target: Any = None) -> ModuleSpec | None:
         if fullname != _MODULE:

@@ -36,18 +36,15 @@ class Sb3FlightEnv(VecEnv):
         self._actions = np.zeros(0)
 
     def reset(self) -> Any:
-        """Begins all flights."""
         seed = self._seeds[0] if self._seeds else None
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0.0, 0
         return self.envs.reset(seed=seed)[0]
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Takes the actions of the next step."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Flies for one step."""
         observed, rewards, terminated, truncated, given = self.envs.step(self._actions)
         self._returns += rewards
         self._lengths += 1
@@ -67,7 +64,6 @@ class Sb3FlightEnv(VecEnv):
         return observed, rewards.astype(np.float32), ended, infos
 
     def close(self) -> None:
-        """Closes the environments."""
         self.envs.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
@@ -80,10 +76,9 @@ class Sb3FlightEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Sets `choices` of the environments; they take others as arguments alone."""
-        if attr_name == "choices":
-            self.envs.choices = value
-            return
-        raise ValueError(f"{attr_name} must be an argument of Sb3FlightEnv, got it by set_attr")
+        what = "an argument of Sb3FlightEnv"
+        require(attr_name == "choices", attr_name, what, "it by set_attr")
+        self.envs.choices = value
 
     def set_options(self, options: Any = None) -> None:
         """Refuses options, since flights begin without a reset of the trainer."""

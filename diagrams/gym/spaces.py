@@ -48,10 +48,7 @@ class Transition(NamedTuple):
 
 @dataclass
 class Reward(Config):
-    """Default reward: the sum of the terms, each times its weight.
-
-    Replace it by any function of a `Transition` that returns (N,).
-    """
+    """Default reward (N,) of a `Transition`: the sum of terms, each times its weight."""
 
     # [1/m] Of progress: how much nearer the goal is than before.
     progress: float = bounded(1.0, "(-inf, inf) 1/m")
@@ -190,7 +187,7 @@ def observe(names: Sequence[str], vehicles: Vehicles) -> dict[str, NDArray[np.fl
 
 
 def observe_image(name: str, image: NDArray[Any], max_depth: float) -> NDArray[Any]:
-    """Returns an observation of `IMAGES` of an image of its port.
+    """Returns an observation of `IMAGES`.
 
     - `depth` (..., H, W, 1) uint8: proximity, 255 (1 - z / `max_depth`) of planar depth z, and 0
       where nothing is seen;

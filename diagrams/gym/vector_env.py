@@ -73,8 +73,7 @@ class VectorFlightEnv(VectorEnv):
 
     Each flight is drawn from a `WorldPool`, whose worlds are made at the beginning, each with 64
     flights: starts, goals and values of the scenario's distributions. Environment i of a `reset`
-    with the seed s draws its flights from the seed s + i. A start, goal and flight of the options
-    hold for one flight.
+    with the seed s draws its flights from the seed s + i.
 
     When a flight ends, infos have its `outcome` and `is_success`, by environments, and masks of
     the environments that have them, `_outcome` and `_is_success`. Then and when the next begins,
@@ -91,7 +90,7 @@ class VectorFlightEnv(VectorEnv):
         fields: of `FlightEnvConfig`.
 
     Raises:
-        InfeasibleFlightError, ValueError: see `WorldPool`.
+        InfeasibleFlightError: also by `reset`, for a world, start or goal that cannot be flown.
     """
 
     def __init__(
@@ -151,8 +150,7 @@ class VectorFlightEnv(VectorEnv):
 
     @property
     def choices(self) -> NDArray[np.intp]:
-        """Numbers of the pool's flights that environments draw among, all at first; set others for
-        a curriculum."""
+        """Numbers of the pool's flights to draw among; set others for a curriculum."""
         return self._choices
 
     @choices.setter
@@ -175,9 +173,8 @@ class VectorFlightEnv(VectorEnv):
 
         Args:
             seed: of the first environment, those of others follow; or one for each.
-            options: `reset_mask` (N,) of the environments to reset, all by default; for them
-                `flight`, a number of the pool's flights or one for each, and `start` and `goal` (3)
-                [m].
+            options: `reset_mask` (N,) of the environments to reset, all by default; for their next
+                flight `flight`, a number in the pool or one for each, `start` and `goal` (3) [m].
         """
         options = options or {}
         points = require_options(options, "reset_mask", "flight")
@@ -259,10 +256,7 @@ class VectorFlightEnv(VectorEnv):
     def step(
         self, actions: Any
     ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Flies for one period of the policy with actions (N, n) in [-1, 1].
-
-        An environment whose flight ended begins the next one as its `autoreset_mode` says.
-        """
+        """Flies for one period of the policy with actions (N, n) in [-1, 1]."""
         config = self.config
         given = require_actions(actions, self._previous.shape)
         resting = self._ended.copy()

@@ -51,10 +51,6 @@ class WorldPool:
     Args:
         configs: whose worlds and flights are made, alike but for their scenarios.
         world: of all flights, instead of made ones.
-
-    Raises:
-        InfeasibleFlightError: for a world, start or goal that cannot be flown.
-        ValueError: for a scenario that native code cannot fly, by the name of its field.
     """
 
     def __init__(self, configs: Sequence[FlightEnvConfig], world: World | None = None) -> None:
@@ -203,8 +199,7 @@ def add_field(worlds: _native.FlightWorlds, field: DistanceField, name: str) -> 
 
 
 def require_supported(config: FlightEnvConfig, scenario: Scenario) -> None:
-    """Raises ValueError, with the name of the field, for what `VectorFlightEnv` cannot fly;
-    `scenario` is that of the configuration, drawn."""
+    """Checks that `VectorFlightEnv` can fly `scenario`, that of the configuration, drawn."""
     neutral = {
         "moving": {},
         "estimator": TrueState(),

@@ -114,11 +114,7 @@ def choose_observed_route(
     seed: int | None = None,
 ) -> ObservedRoute:
     """Chooses a shortest route through known free space, at least `min_length` [m] long, with a
-    mean fraction of unobserved pixels up to `limit`; nearly the longest, or drawn from a seed.
-
-    Raises:
-        InfeasibleFlightError: if no such route is found.
-    """
+    mean fraction of unobserved pixels up to `limit`; nearly the longest, or drawn from a seed."""
     search, longest = _search(world, limit, min_length)
     if longest is None:
         raise InfeasibleFlightError(

@@ -1,10 +1,9 @@
 """Scene folders: a reconstructed environment on disk.
 
-`gaussians.ply`, or `gaussians.spz` in scenes that were packed, is for cameras, `esdf.npz` for
-collisions, and `scene.yaml` is `SceneMetadata`.
-`environment.png`, if present, is the background (`EnvironmentMap`). `frontier.ply`, if present,
-closes the scene at unobserved space: cameras of flights see it, metrics of the scene do not.
-`observations.npz`, if present, tells how often and from where images saw each surface.
+`gaussians.ply`, or packed `gaussians.spz`, is for cameras, `esdf.npz` for collisions, and
+`scene.yaml` is `SceneMetadata`. If present, `environment.png` is the background, `frontier.ply`
+closes unobserved space for cameras of flights, and `observations.npz` tells how often and from
+where images saw each surface.
 """
 
 import functools
@@ -332,7 +331,6 @@ def close_frontier(
     Returns the distance field with obstacles where unknown space begins, and surfels that draw
     them; `esdf` and None if the scene is closed. Space before the sky, and before surfaces
     beyond the field's range, has no obstacles; its surfels begin behind all that the images saw.
-    For depths, K and X_WCs see `esdf_from_depth_images`.
     """
     images = []
     for depth in depths:

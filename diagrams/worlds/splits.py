@@ -1,7 +1,6 @@
-"""Splits of scenes: training, validation or test.
+"""Splits of scenes: training, validation or test, by digests of what they show.
 
-A split belongs to what a scene shows, not to its files. So a scene states digests of its source,
-and `test_sources.yaml` has those of the sources reserved for tests.
+`test_sources.yaml` has those of the sources reserved for tests.
 """
 
 from collections.abc import Collection, Iterable

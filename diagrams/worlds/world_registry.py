@@ -32,9 +32,7 @@ class WorldConfig(Protocol):
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
-    def validate(self) -> None:
-        """Raises ValueError on an invalid field."""
-        ...
+    def validate(self) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -55,9 +53,8 @@ def register_world(
     make: Callable[[Any, int], World] | None = None,
     make_spec: Callable[[Any, int], WorldSpec] | None = None,
 ) -> None:
-    """Registers a world, so that scenarios can name it by its configuration's type. `make` and
-    `make_spec` map a configuration and a seed to a world and to a spec, to train and render
-    captures in it; by default `make` draws the spec."""
+    """Registers a world by its configuration's type. `make` and `make_spec` map a configuration
+    and a seed to a world and to a spec, to train and render in; by default `make` draws it."""
     if make is None and make_spec is None:
         raise ValueError(f"{config.__name__}: give make or make_spec")
     require_configuration(config)
@@ -66,11 +63,8 @@ def register_world(
 
 
 def make_world(config: WorldConfig, seed: int) -> World:
-    """Generates or reads the world of a registered configuration.
-
-    The seed is of generated worlds, inserted obstacles, start and goal if they are drawn, and the
-    distributions of the configuration, see `sample_scenario`.
-    """
+    """Generates or reads the world of a registered configuration. The seed is of all that is
+    generated or drawn, also from the configuration's distributions, see `sample_scenario`."""
     config = _draw(config, seed)
     world = WORLDS.entry_for(config).make(config, seed)
     if not isinstance(world, World):

@@ -87,7 +87,7 @@ def to_gaussians(surfels: Surfels, colors: ArrayLike, opacity: ArrayLike) -> Gau
 
 def merge(scenes: list[GaussianScene]) -> GaussianScene:
     """Joins scenes."""
-    return GaussianScene(*concatenated(scenes))
+    return GaussianScene(**concatenated(scenes))
 
 
 def perpendicular(d: ArrayLike) -> NDArray[np.float64]:
