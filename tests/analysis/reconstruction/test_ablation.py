@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.reconstruction import ablation
+from splatpilot.analysis.reconstruction import ablation, measure_scene
 from splatpilot.analysis.reconstruction.ablation import ARMS, AblationResult, arm_config
 from splatpilot.analysis.reconstruction.measure_scene import SceneMetrics
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
@@ -15,6 +15,7 @@ from splatpilot.training.reconstruction.metrics import ViewMetrics
 
 
 def test_ablation_end_to_end(room, set_fields, capsys, monkeypatch):
+    monkeypatch.setattr(measure_scene, "_write_views", lambda *_: None)  # which take seconds
     settings = ("iterations=4", "threads=1", "initial_gaussians=500", "voxel_size=0.3")
     out, settings = room.folder / "out", set_fields(*settings, "image_width=32")
     ablate = ["scene", "ablate", "room", "--out", str(out), *settings]

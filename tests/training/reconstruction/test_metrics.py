@@ -17,7 +17,6 @@ from torch.nn.functional import conv2d, max_pool2d
 from splatpilot.systems.splats.background import RenderedView
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction import metrics
-from splatpilot.training.reconstruction import metrics as module
 from splatpilot.training.reconstruction.metrics import Lpips, squeezenet_features
 from splatpilot.training.reconstruction.photometry import vignette
 
@@ -32,11 +31,7 @@ def noise(seed: int = 0) -> np.ndarray:
 
 
 def test_ssim():
-    a, b = np.full((64, 64, 3), 0.4), np.full((64, 64, 3), 0.6)
-    everywhere = np.ones((64, 64), bool)
-    luminance = (2 * 0.4 * 0.6 + 1e-4) / (0.4**2 + 0.6**2 + 1e-4)
-    assert metrics.ssim(a, b, everywhere) == pytest.approx(luminance, abs=0.03)
-    assert metrics.ssim(a, a, everywhere) == pytest.approx(1, abs=1e-6)
+    assert metrics.ssim(noise(), noise(), EVERYWHERE) == pytest.approx(1, abs=1e-6)
     whole = metrics.ssim(noise(0), noise(1), EVERYWHERE)
     assert whole < 0.3
     for fraction in (0.2, 0.5, 0.8):
@@ -86,8 +81,6 @@ def test_metrics_of_a_view():
     assert found.gain == pytest.approx(1.2, rel=1e-3) and found.lpips is None
     assert found.depth_mae_m == found.floater_fraction == pytest.approx(0.25)
     assert found.depth_relative == pytest.approx(0.125) and found.hole_fraction == 0
-    dark = metrics.measure_view(*make_view(0 * color, exposed))
-    assert dark.gain == 1.0
 
 
 def test_a_translucent_surface_is_a_hole():
@@ -199,7 +192,7 @@ def file(tmp_path, monkeypatch, weights) -> Path:
 @pytest.fixture
 def lpips(file, monkeypatch) -> Lpips:
     monkeypatch.setitem(sys.modules, "torchvision", None)  # which takes seconds to import
-    return importlib.reload(module).Lpips()
+    return importlib.reload(metrics).Lpips()
 
 
 def reference(weights: dict, a: torch.Tensor, b: torch.Tensor) -> float:
@@ -267,11 +260,7 @@ def test_pixels_without_weight_hardly_count(lpips):
 def test_missing_weights(tmp_path, monkeypatch):
     monkeypatch.setenv("SPLATPILOT_DATA", str(tmp_path))
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    message = r"no weights.*lpips_squeeze\.pt.*pip install lpips"
-    with pytest.raises(FileNotFoundError, match=message):
-        Lpips()
-    monkeypatch.delenv("SPLATPILOT_DATA")
-    with pytest.raises(FileNotFoundError, match=message):
+    with pytest.raises(FileNotFoundError, match=r"no weights.*lpips_squeeze\.pt.*pip install lp"):
         Lpips()
 
 
