@@ -7,6 +7,7 @@ import pytest
 
 from splatpilot.analysis.benchmark import run_study
 from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.commands.main import main
 
 SHORT = (
     "world: {length: 8, width: 5, height: 3, rocks: 0, logs: 0, voxel_size: 0.25}\ntimeout: 1.5\n"
@@ -19,6 +20,17 @@ def short_scenario(tmp_path) -> Path:
     path = tmp_path / "short.yaml"
     path.write_text(SHORT)
     return path
+
+
+@pytest.fixture
+def benchmark(short_scenario, tmp_path) -> Callable[..., int]:
+    """Runs `splatpilot benchmark` in the short scenario, with one seed in this process."""
+
+    def run(out: str, *words: str) -> int:
+        options = ["--out", str(tmp_path / out), "--seeds", "1", "--jobs", "1", *words]
+        return main(["benchmark", "--scenarios", str(short_scenario), *options])
+
+    return run
 
 
 @pytest.fixture

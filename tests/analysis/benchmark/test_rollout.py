@@ -17,7 +17,6 @@ from splatpilot.analysis.benchmark.rollout import (
 from splatpilot.analysis.benchmark.run_study import fly_all
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder, keep_inputs, kept_flights
-from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.flight.simulation import Flight, Outcome
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
@@ -76,18 +75,15 @@ def test_shortest_path_goes_around_a_post():
     assert math.isnan(shortest_length(lengths, np.array([5.0, 0.0, 2.0]), 0.3))
 
 
-def test_infeasible_flights_fail_with_a_reason(short_scenario, tmp_path, capsys, rows_of):
-    out, overrides = tmp_path / "near", ["goal=[6.5, 0, 0.36]"]
-    config = StudyConfig([str(short_scenario)], ["straight", "planner"], [2.0], 1, overrides)
-    table = run_study.run(config=config, out=out, jobs=1).table
+def test_infeasible_flights_fail_with_a_reason(benchmark, tmp_path, capsys, rows_of):
+    words = ["--policies", "straight,planner", "--json", "--set"]
+    assert benchmark("near", *words, "goal=[6.5, 0, 0.36]") == 0
+    table = json.loads(capsys.readouterr().out)
     assert [row["infeasible"] for row in table] == [0, 1]
     assert (table[1]["flights"], table[1]["successes"]) == (1, 0)
-    assert "must be at least" in rows_of(out / "rollouts.csv")[1]["reason"]
+    assert "must be at least" in rows_of(tmp_path / "near" / "rollouts.csv")[1]["reason"]
 
-    words = ["benchmark", "--scenarios", str(short_scenario), "--policies", "straight,planner"]
-    words += ["--seeds", "1", "--jobs", "1", "--set", "goal=[50, 0, 1.8]", "--json"]
-    capsys.readouterr()
-    assert main([*words, "--out", str(tmp_path / "far")]) == 1  # a failure with a result
+    assert benchmark("far", *words, "goal=[50, 0, 1.8]") == 1  # a failure with a result
     printed = capsys.readouterr()
     assert "short-straight-2-000, infeasible: goal" in printed.err
     assert "none of the flights could be flown" in printed.err
@@ -118,12 +114,12 @@ def fail_later(monkeypatch, error):
 
 
 def test_a_flight_that_becomes_infeasible_is_an_error_of_its_row(
-    short_scenario, tmp_path, monkeypatch, rows_of
+    benchmark, tmp_path, monkeypatch, rows_of
 ):
     fail_later(monkeypatch, sp.InfeasibleFlightError("no route leads to the goal"))
-    config = StudyConfig([str(short_scenario)], ["straight", "planner"], [2.0], 1)
-    straight, planner = run_study.run(config=config, out=tmp_path / "out", jobs=1).table
-    assert (straight["error"], straight["infeasible"], planner["error"]) == (1, 0, 0)
+    assert benchmark("out", "--policies", "straight,planner") == 0
+    straight, planner = rows_of(tmp_path / "out" / "table.csv")
+    assert (straight["error"], straight["infeasible"], planner["error"]) == ("1", "0", "0")
     row = rows_of(tmp_path / "out" / "rollouts.csv")[0]
     assert row["outcome"] == "error" and 0.5 < float(row["flight_time_s"]) < 0.6
     assert row["reason"].startswith("at t = 0.53 s, p_WB = [")
@@ -132,21 +128,19 @@ def test_a_flight_that_becomes_infeasible_is_an_error_of_its_row(
 
 
 def test_an_exception_stops_the_study_which_is_resumed(
-    short_scenario, tmp_path, monkeypatch, capsys, rows_of
+    benchmark, tmp_path, monkeypatch, capsys, rows_of
 ):
-    out = tmp_path / "out"
-    words = ["benchmark", "--out", str(out), "--scenarios", str(short_scenario), "--seeds", "1"]
-    words += ["--policies", "straight,straight:rate=7", "--jobs", "1"]
+    out, words = tmp_path / "out", ("out", "--policies", "straight,straight:rate=7")
     with monkeypatch.context() as patch:
         fail_later(patch, KeyError("depth"))
-        assert main(words) == 1
+        assert benchmark(*words) == 1
     error, file = capsys.readouterr().err, out / "errors" / "short-straight-2-000.txt"
     assert "flight short-straight-2-000 was ended by an exception" in error
     assert "at t = 0.53 s, p_WB = [" in error and "KeyError: 'depth'" in error
     assert str(file) in error and "in update_or_fail" in file.read_text()
     assert not (out / "rollouts.csv").exists()
 
-    assert main(words) == 0
+    assert benchmark(*words) == 0
     assert not (out / "errors").exists()
     assert len(rows_of(out / "rollouts.csv")) == 2
 

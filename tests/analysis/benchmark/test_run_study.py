@@ -20,7 +20,7 @@ from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.analysis.benchmark.tables import DODGEDRONE_SPEEDS, PUBLISHED
 from splatpilot.analysis.benchmark.variants import BENCHMARK_POLICIES
 from splatpilot.analysis.commands.main import main
-from splatpilot.diagrams.flight.policies import POLICIES, policy_named
+from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.systems.policies.reactive import ReactiveConfig
 from splatpilot.systems.policies.straight import Straight, StraightConfig
 
@@ -68,15 +68,14 @@ def test_study_has_all_flights_tables_and_a_report(study, rows_of):
     assert not list(out.rglob(".*"))
 
 
-def test_study_interrupted_before_its_flights_is_resumed(short_scenario, tmp_path, monkeypatch):
+def test_study_interrupted_before_its_flights_is_resumed(benchmark, monkeypatch):
     def interrupt(*words):
         raise KeyboardInterrupt
 
-    config = StudyConfig([str(short_scenario)], ["straight"], seeds=1)
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         patch.setattr(run_study, "keep_inputs", interrupt)
-        run_study.run(config=config, out=tmp_path / "begun", jobs=1)
-    assert len(run_study.run(config=config, out=tmp_path / "begun", jobs=1).rows) == 1
+        assert benchmark("begun", "--policies", "straight") == 130
+    assert benchmark("begun", "--policies", "straight") == 0
 
 
 def test_damaged_files_are_flown_again_and_reported(study, tmp_path, capsys, contents):
@@ -286,11 +285,10 @@ def test_a_study_is_not_continued_by_a_function_that_holds_other_values(short, t
             fly(other)
 
 
-def test_what_worker_processes_cannot_import_is_refused(short, monkeypatch):
+def test_what_worker_processes_cannot_import_is_refused(short, registered):
     lock = threading.Lock()
     with pytest.raises(ValueError, match=r"policy up must be picklable .*; use one job"):
         sp.study(short, policies={"up": lambda *_: lock and Climb()}, seeds=1, jobs=2)
-    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
     for _ in range(2):  # as runs of a notebook's cell
 
         @dataclass
@@ -336,11 +334,10 @@ def test_speeds_are_those_of_the_configurations(short):
         sp.study(short, policies=["scenario", ReactiveConfig(speed=3.0)], seeds=1, jobs=1)
 
 
-def test_command_line_sweeps_fields_of_scenarios(short_scenario, tmp_path, rows_of):
+def test_command_line_sweeps_fields_of_scenarios(benchmark, short_scenario, tmp_path, rows_of):
     out, goal_radius = tmp_path / "out", "goal_radius=!Uniform {min: 0.3, max: 0.4}"
-    words = ["benchmark", "--scenarios", str(short_scenario), "--policies", "straight", "--seeds"]
-    words += ["1", "--jobs", "1", "--out", str(out), "--sweep", "vehicle.drag=0.3,0.5"]
-    assert main([*words, "--set", goal_radius]) == 0
+    words = "--policies", "straight", "--sweep", "vehicle.drag=0.3,0.5", "--set", goal_radius
+    assert benchmark("out", *words) == 0
     rows = rows_of(out / "rollouts.csv")
     assert [row["vehicle.drag"] for row in rows] == ["0.3", "0.5"]
     assert all(0.3 <= float(row["goal_radius"]) <= 0.4 for row in rows)
@@ -350,8 +347,7 @@ def test_command_line_sweeps_fields_of_scenarios(short_scenario, tmp_path, rows_
     assert StudyFolder(out).config() == expected
 
 
-def test_policies_of_others_have_their_own_files_of_weights(short, tmp_path, monkeypatch):
-    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
+def test_policies_of_others_have_their_own_files_of_weights(short, tmp_path, registered):
     sp.register_policy(ClimbConfig, lambda config, *_: Climb(float(np.loadtxt(config.weights))))
     file, out = tmp_path / "w.txt", tmp_path / "out"
     file.write_text("1")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpilot.analysis.benchmark import replay, run_study
+from splatpilot.analysis.benchmark import replay
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import (
     StudyFolder,
@@ -15,7 +15,6 @@ from splatpilot.analysis.benchmark.study_folder import (
     plugin_digests,
 )
 from splatpilot.analysis.commands.main import main
-from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.systems.common.provenance import program
 from splatpilot.systems.policies import checkpoint
@@ -78,64 +77,59 @@ def save_weights(file: Path, thrust: float = 0.0) -> Path:
     return file
 
 
-def test_weights_from_a_file_fly_and_are_kept(short_scenario, tmp_path, rows_of):
-    mine = save_weights(tmp_path / "mine.npz", 2.0)
-    policies = ["diffaero", str(mine), f"diffaero.1={mine}"]
-    config = StudyConfig([str(short_scenario)], policies, seeds=1)
-    folder = StudyFolder(tmp_path / "out")
-    run_study.run(config=config, out=folder.path, jobs=1)
+def test_weights_from_a_file_fly_and_are_kept(benchmark, tmp_path, rows_of, capsys):
+    mine, folder = save_weights(tmp_path / "mine.npz", 2.0), StudyFolder(tmp_path / "out")
+    words = "out", "--policies", f"diffaero,{mine},diffaero.1={mine}"
+    assert benchmark(*words) == 0
     rows = rows_of(folder.path / "rollouts.csv")
     assert [row["policy"] for row in rows] == ["diffaero", "mine", "diffaero.1"]
     assert rows[0]["digest"] != rows[1]["digest"] == rows[2]["digest"]
-    states = folder.read(config.rollouts()[1])[1]["states"]
+    states = folder.read(folder.config().rollouts()[1])[1]["states"]
     assert states[-1, 2] - states[0, 2] > 1.0 and states[-1, 5] > 2.0  # straight up
 
     save_weights(mine, -2.0)
-    with pytest.raises(ValueError, match=r"mine.npz has changed since"):
-        run_study.run(config=config, out=folder.path, jobs=1)
+    assert benchmark(*words) == 1
+    assert "mine.npz has changed since" in capsys.readouterr().err
     mine.unlink()
     assert replay.run(study=folder.path, id="short-mine-2-000")
 
 
-def test_study_is_not_resumed_with_other_shipped_weights(short_scenario, tmp_path, monkeypatch):
+def test_study_is_not_resumed_with_other_shipped_weights(benchmark, tmp_path, monkeypatch, capsys):
     save_weights(tmp_path / "diffaero.npz")
     monkeypatch.setattr(checkpoint, "_SHIPPED", tmp_path)
-    config = StudyConfig([str(short_scenario)], ["diffaero"], seeds=2)
-    folder = StudyFolder(tmp_path / "out")
-    run_study.run(config=config, out=folder.path, jobs=1)
+    words, folder = ("out", "--policies", "diffaero", "--seeds", "2"), StudyFolder(tmp_path / "out")
+    assert benchmark(*words) == 0
     assert len(folder.program()["weights of diffaero"]) == 16
 
     save_weights(tmp_path / "diffaero.npz", 1.0)
     folder.trajectory("short-diffaero-2-001").unlink()
-    with pytest.raises(ValueError, match=r"weights of diffaero .*must be .* it was started"):
-        run_study.run(config=config, out=folder.path, jobs=1)
+    assert benchmark(*words) == 1
+    error = capsys.readouterr().err
+    assert "weights of diffaero of" in error and "with which it was started" in error
 
 
-def test_variants_of_a_policy_fly_side_by_side(short_scenario, tmp_path, rows_of):
-    out = tmp_path / "out"
-    words = ["--scenarios", str(short_scenario), "--seeds", "1", "--jobs", "1"]
-    words += ["--policies", "slow=planner:rate=2,planner", "--sweep", "straight:rate=5,10"]
-    assert main(["benchmark", "--out", str(out), *words]) == 0
-    rows = rows_of(out / "rollouts.csv")
+def test_variants_of_a_policy_fly_side_by_side(benchmark, tmp_path, rows_of):
+    policies = "slow=planner:rate=2,planner"
+    assert benchmark("out", "--policies", policies, "--sweep", "straight:rate=5,10") == 0
+    rows = rows_of(tmp_path / "out" / "rollouts.csv")
     labels = ["slow", "planner", "straight-rate-5", "straight-rate-10"]
     assert [row["policy"] for row in rows] == labels
     assert len({row["digest"] for row in rows}) == 4
-    assert replay.run(study=out, id="short-slow-2-000")
+    assert replay.run(study=tmp_path / "out", id="short-slow-2-000")
 
 
-def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, capsys):
+def test_own_policy_of_a_scenario_flies_and_is_kept(benchmark, short_scenario, tmp_path, capsys):
     mine = save_weights(tmp_path / "mine.npz")
     text = short_scenario.read_text() + f"policy: !DiffAeroConfig {{weights: {mine}}}\n"
     short_scenario.write_text(text)
-    words = ["benchmark", "--scenarios", str(short_scenario), "--seeds", "1", "--jobs", "1"]
-    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    assert benchmark("out") == 0
     assert "is not flown" not in capsys.readouterr().out
     assert short_scenario.read_text() == text
     mine.unlink()
     moved = (tmp_path / "out").rename(tmp_path / "moved")
     assert replay.run(study=moved, id="short-scenario-2-000")
 
-    assert main([*words, "--out", str(tmp_path / "other"), "--policies", "straight"]) == 0
+    assert benchmark("other", "--policies", "straight") == 0
     assert f"The policy of {short_scenario} is not flown" in capsys.readouterr().out
 
 
@@ -187,7 +181,8 @@ splatpilot.register_policy(StrayingConfig, lambda config, world, scenario: Strai
 """
 
 
-def test_a_study_is_flown_by_one_version_of_a_plugin(short_scenario, tmp_path, capsys, monkeypatch):
+@pytest.mark.usefixtures("short_scenario", "registered")
+def test_a_study_is_flown_by_one_version_of_a_plugin(tmp_path, capsys, monkeypatch):
     package = tmp_path / "straying"
     package.mkdir()
     (package / "__init__.py").touch()
@@ -195,7 +190,6 @@ def test_a_study_is_flown_by_one_version_of_a_plugin(short_scenario, tmp_path, c
     (package / "policy.py").write_text(POLICY)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
 
     def read_versions() -> dict[str, str]:
         return StudyFolder(tmp_path / "study").program()
