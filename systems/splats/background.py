@@ -30,10 +30,9 @@ class RenderedView(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentMap:
-    """Colors of the background by direction in W, equirectangular.
+    """Colors of the background by direction in W, equirectangular, bilinear between texel centers.
 
-    Row 0 looks up and the last row down; column 0 begins at azimuth -180 deg, and azimuth grows
-    with the columns, from x (0) to y (90 deg). Colors are interpolated between texel centers.
+    Row 0 looks up; azimuth grows with the columns from -180 deg, from x (0) to y (90 deg).
     """
 
     texels: "NDArray[np.float32]"  # (h, w, 3), red, green, blue in [0, 1]
@@ -87,12 +86,9 @@ def texel_position(
     return row, (np.arctan2(y, x) / (2 * np.pi) + 0.5) * width
 
 
-def pixel_rays(
-    K: "NDArray", rows: "NDArray", columns: "NDArray", X_WC: "RigidTransform"
-) -> "NDArray[np.float64]":
-    """Returns the directions v_W (n, 3) of a pinhole camera's pixels (row, column)."""
-    u, v = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
-    return np.column_stack([u, v, np.ones_like(u)]) @ X_WC.rotation().matrix().T
+def pixel_rays(slopes: "NDArray", X_WC: "RigidTransform") -> "NDArray[np.float64]":
+    """Returns the directions v_W (n, 3) of pixels with `slopes` (n, 2), see `pixel_slopes`."""
+    return np.column_stack([slopes, np.ones(len(slopes))]) @ X_WC.rotation().matrix().T
 
 
 def put_behind(
@@ -105,10 +101,8 @@ def put_behind(
     of the pixels see `pixel_slopes`."""
     color = view.color.copy()
     rows, columns = np.nonzero((view.alpha < 1 - _MIN_LIGHT) & np.isfinite(slopes[..., 0]))
-    v_C = np.column_stack([slopes[rows, columns], np.ones(len(rows))])
-    v_W = v_C @ X_WC.rotation().matrix().T
     if isinstance(background, EnvironmentMap):
-        behind = background.color(v_W)
+        behind = background.color(pixel_rays(slopes[rows, columns], X_WC))
     else:
         behind = np.asarray(background, dtype=np.float32)
     color[rows, columns] += (1 - view.alpha[rows, columns])[:, None] * behind

@@ -17,7 +17,7 @@ from splatpilot.systems.splats.background import (
     put_behind,
 )
 from splatpilot.systems.splats.lens import Distortion, native_lens, pixel_slopes
-from splatpilot.systems.splats.scene import GaussianScene, concatenated, harmonic_degree
+from splatpilot.systems.splats.scene import ARRAYS, GaussianScene, concatenated, harmonic_degree
 
 if TYPE_CHECKING:
     from pydrake.math import RigidTransform
@@ -42,7 +42,7 @@ NO_GAUSSIANS = PlacedGaussians(
 
 def placed_together(parts: "Sequence[GaussianScene | PlacedGaussians]") -> PlacedGaussians:
     """Concatenates Gaussians; lower degrees of spherical harmonics are padded with zeros."""
-    return PlacedGaussians(*concatenated(parts)) if parts else NO_GAUSSIANS
+    return PlacedGaussians(**concatenated(parts)) if parts else NO_GAUSSIANS
 
 
 class MovingGaussians:
@@ -77,7 +77,7 @@ def create_renderer(threads: int = 1, simd: str = "") -> _native.Renderer:
     """Creates CPU threads and memory for several images, which do not depend on either.
 
     Args:
-        threads: 1 to 1024; an OSError if the system refuses to start them.
+        threads: 1 to 1024.
         simd: one of `splatpilot._native.simd_levels()`; by default the environment variable
             SPLATPILOT_SIMD, else the widest of this machine.
     """
@@ -106,21 +106,11 @@ def check_camera(K: ArrayLike, width: int, height: int, near: float, far: float)
 
 
 def _native_gaussians(gaussians: "GaussianScene | PlacedGaussians") -> _native.Gaussians:
-    means, quats, scales, opacities, sh = (
-        np.ascontiguousarray(getattr(gaussians, name), dtype=np.float32)
-        for name in PlacedGaussians._fields
+    *shapes, sh = (
+        np.ascontiguousarray(getattr(gaussians, name), dtype=np.float32) for name in ARRAYS
     )
-    return _native.Gaussians(
-        means=means,
-        quats=quats,
-        scales=scales,
-        opacities=opacities,
-        colors=sh,
-        sh_degree=harmonic_degree(sh.shape[1]),
-    )
-
-
-_ALL = "color", "depth", "alpha"
+    arrays = dict(zip(ARRAYS[:-1], shapes, strict=True))
+    return _native.Gaussians(**arrays, colors=sh, sh_degree=harmonic_degree(sh.shape[1]))
 
 
 class BakedScene:
@@ -144,9 +134,8 @@ class BakedScene:
         valid = sh.ndim == 3 and sh.shape[::2] == (count, 3)
         require(valid, "sh", f"of shape ({count}, K, 3)", sh.shape)
         recolored = object.__new__(BakedScene)
+        vars(recolored).update(vars(self))
         recolored._scene = self._scene.recolored(sh, harmonic_degree(sh.shape[1]))
-        recolored._renderer = self._renderer
-        recolored._antialiased = self._antialiased
         return recolored
 
     def render(
@@ -184,8 +173,7 @@ class BakedScene:
         options = {"moving": moving, "distortion": distortion, "max_depth": max_depth}
         options |= {"background": background, "merged_spread": merged_spread, "rows": rows}
         camera = K, width, height, X_WC, near, far
-        apart = self._antialiased or merged_spread > 0
-        return _render_all(self._render, apart, *camera, **options)
+        return _render_all(self._render, [self], *camera, **options)
 
     def render_color(self, *camera: Any, **options: Any) -> NDArray[np.float32]:
         """Renders the color (H, W, 3), bitwise identical to that of `render` but faster.
@@ -195,10 +183,7 @@ class BakedScene:
         return self._render(("color", "alpha"), *camera, **options).color
 
     def render_depth(self, *camera: Any, **options: Any) -> NDArray[np.float32]:
-        """Renders the median depth (H, W) [m], bitwise identical to that of `render` but faster.
-
-        The arguments are those of `render`; all beyond `far` by name.
-        """
+        """Renders the median depth (H, W) [m] alone, see `render_color`."""
         return self._render(("depth",), *camera, **options).depth
 
     def _render(
@@ -213,20 +198,12 @@ class BakedScene:
         moving: PlacedGaussians = NO_GAUSSIANS,
         **options: Any,
     ) -> RenderedView:
-        """Renders images of these names; the others are empty."""
-        camera = _checked_camera(names, K, width, height, *clip, **options)
-        (color,) = _background_colors([background])
-        slopes = _slopes(K, width, height, [background], **options)
-        images = _new_images(names, (), width, height, options.get("rows"))
-        _native.render_baked(
-            self._scene,
-            self._renderer,
-            _native_gaussians(moving),
-            camera(self, X_WC),
-            background=color,
-            **{name: image if name in names else None for name, image in images.items()},
-        )
-        return _finished(images, [background], [X_WC], slopes)
+        def draw(cameras: list[_native.Camera], colors: NDArray, images: dict[str, Any]) -> None:
+            scene = self._scene, self._renderer, _native_gaussians(moving)
+            _native.render_baked(*scene, cameras[0], background=colors[0], **images)
+
+        views = [self], [X_WC], [background]
+        return _render_views(draw, names, (), views, K, width, height, *clip, **options)
 
 
 class BatchRenderer:
@@ -247,9 +224,7 @@ class BatchRenderer:
                 `moving`, with the N poses X_WC; all beyond `far` by name.
             options: the same; `backgrounds` are those of the N views, black by default.
         """
-        apart = any(scene._antialiased for scene in cameras[0])
-        apart |= options.get("merged_spread", 0.0) > 0
-        return _render_all(self._render, apart, *cameras, **options)
+        return _render_all(self._render, cameras[0], *cameras, **options)
 
     def render_color(self, *cameras: Any, **options: Any) -> NDArray[np.float32]:
         """Renders the colors (N, H, W, 3) alone, which is faster; see `render`."""
@@ -271,106 +246,40 @@ class BatchRenderer:
         backgrounds: Sequence[Background] | None = None,
         **options: Any,
     ) -> RenderedView:
-        """Renders images of these names; the others are empty."""
         count = len(scenes)
         backgrounds = [BLACK] * count if backgrounds is None else backgrounds
         for name, rows in (("poses", X_WCs), ("backgrounds", backgrounds)):
             condition = f"that of scenes, {count}"
             require(len(rows) == count, f"the number of {name}", condition, len(rows))
-        camera = _checked_camera(names, K, width, height, *clip, **options)
-        slopes = _slopes(K, width, height, backgrounds, **options)
-        images = _new_images(names, (count,), width, height, options.get("rows"))
-        _native.render_views(
-            self._renderer,
-            [scene._scene for scene in scenes],
-            [camera(scene, X_WC) for scene, X_WC in zip(scenes, X_WCs, strict=True)],
-            backgrounds=_background_colors(backgrounds),
-            **{name: image if name in names else None for name, image in images.items()},
-        )
-        return _finished(images, backgrounds, X_WCs, slopes)
+
+        def draw(cameras: list[_native.Camera], colors: NDArray, images: dict[str, Any]) -> None:
+            baked = [scene._scene for scene in scenes]
+            _native.render_views(self._renderer, baked, cameras, backgrounds=colors, **images)
+
+        views = scenes, X_WCs, backgrounds
+        return _render_views(draw, names, (count,), views, K, width, height, *clip, **options)
 
 
 def _render_all(
-    render: Callable[..., RenderedView], apart: bool, *cameras: Any, **options: Any
+    render: Callable[..., RenderedView], scenes: Sequence[BakedScene], *cameras: Any, **options: Any
 ) -> RenderedView:
-    """Renders all images, color and depth `apart` if their Gaussians differ: where neighbors merge,
+    """Renders all images, color and depth apart if their Gaussians differ: where neighbors merge,
     and in scenes that were trained antialiased, whose opacities blur makes lower for color."""
-    if not apart:
-        return render(_ALL, *cameras, **options)
+    merges = options.get("merged_spread", 0.0) > 0
+    if not merges and not any(scene._antialiased for scene in scenes):
+        return render(tuple(_CHANNELS), *cameras, **options)
     depth = render(("depth",), *cameras, **options).depth
     return render(("color", "alpha"), *cameras, **options)._replace(depth=depth)
 
 
-def _new_images(
+_CHANNELS = {"color": 3, "depth": 1, "alpha": 1}
+
+
+def _render_views(
+    draw: Callable[..., None],
     names: tuple[str, ...],
-    views: tuple[int, ...],
-    width: int,
-    height: int,
-    rows: tuple[int, int] | None,
-) -> dict[str, NDArray[np.float32]]:
-    """Returns arrays for images (*views, H, W, channels) of these rows; others have no pixels."""
-    first, last = rows or (0, height)
-    return {
-        name: np.empty(
-            (*views, *((last - first, width) if name in names else (0, 0)), channels), np.float32
-        )
-        for name, channels in {"color": 3, "depth": 1, "alpha": 1}.items()
-    }
-
-
-def _background_colors(backgrounds: Sequence[Background]) -> NDArray[np.float32]:
-    """Returns the colors (N, 3) behind N views; black for environments, which follow."""
-    colors = [BLACK if isinstance(behind, EnvironmentMap) else behind for behind in backgrounds]
-    for color in colors:
-        valid = len(color) == 3 and np.isfinite(color).all()
-        require(valid, "background", "3 finite numbers", list(color))
-    return np.array(colors, np.float32).reshape(-1, 3)
-
-
-def _slopes(
-    K: ArrayLike,
-    width: int,
-    height: int,
-    backgrounds: Sequence[Background],
-    *,
-    distortion: Distortion | None = None,
-    rows: tuple[int, int] | None = None,
-    **_: Any,
-) -> NDArray[np.float64] | None:
-    """Returns the slopes (H, W, 2) of the pixels that are rendered, if `_finished` needs them."""
-    if distortion is None and not any(isinstance(each, EnvironmentMap) for each in backgrounds):
-        return None
-    return pixel_slopes(distortion, np.asarray(K, float), width, height)[slice(*rows or (None,))]
-
-
-def _finished(
-    images: dict[str, NDArray[np.float32]],
-    backgrounds: Sequence[Background],
-    X_WCs: "Sequence[RigidTransform]",
-    slopes: NDArray[np.float64] | None,
-) -> RenderedView:
-    """Returns the views of images (..., H, W, channels): pixels without a ray are zero, and
-    environments stand behind.
-
-    Args:
-        backgrounds, X_WCs: of the N views.
-    """
-    if slopes is not None:
-        hidden = np.flatnonzero(np.isnan(slopes[..., 0]))
-        for image in filter(np.size, images.values()):
-            height, width, channels = image.shape[-3:]
-            image.reshape(-1, height * width, channels)[:, hidden] = 0.0
-    view = RenderedView(images["color"], images["depth"][..., 0], images["alpha"][..., 0])
-    for i, background in enumerate(backgrounds):
-        if view.color.size and isinstance(background, EnvironmentMap):
-            part = view if view.depth.ndim == 2 else RenderedView(*(image[i] for image in view))
-            assert slopes is not None
-            part.color[:] = put_behind(part, background, slopes, X_WCs[i]).color
-    return view
-
-
-def _checked_camera(
-    names: tuple[str, ...],
+    shape: tuple[int, ...],
+    views: "tuple[Sequence[BakedScene], Sequence[RigidTransform], Sequence[Background]]",
     K: ArrayLike,
     width: int,
     height: int,
@@ -381,11 +290,18 @@ def _checked_camera(
     max_depth: float = np.inf,
     merged_spread: float = 0.0,
     rows: tuple[int, int] | None = None,
-) -> "Callable[[BakedScene, RigidTransform], _native.Camera]":
-    """Checks a camera; returns the function from a scene and the pose to the native one."""
+) -> RenderedView:
+    """Renders images (*shape, H, W, channels) of these names; the others are empty.
+
+    Args:
+        draw: takes native cameras, colors (N, 3) behind them, and images.
+        shape: () for one view, else (N,).
+        views: scenes, poses X_WC and backgrounds.
+    """
     K = check_camera(K, width, height, near, far)
     require(max_depth > 0, "max_depth", "> 0 m", max_depth)
     require(0 <= merged_spread < np.inf, "merged_spread", "finite and >= 0 px", merged_spread)
+    merged_spread = merged_spread if "color" in names else 0.0
     first, last = rows or (0, height)
     require(0 <= first < last <= height, "rows", f"in [0, {height}]", rows)
     K_rows, num_rows = K.copy(), last - first
@@ -395,12 +311,12 @@ def _checked_camera(
         whole = native_lens(distortion, K, width, height)
         part = native_lens(distortion, K_rows, width, num_rows)
         lens = whole.with_rows(part)._asdict()
-
-    def make(scene: BakedScene, X_WC: "RigidTransform") -> _native.Camera:
-        merged = merged_spread if "color" in names else 0.0
-        if merged:
+    scenes, X_WCs, backgrounds = views
+    cameras = []
+    for scene, X_WC in zip(scenes, X_WCs, strict=True):
+        if merged_spread:
             scene._scene.merge_neighbors()
-        return _native.Camera(
+        camera = _native.Camera(
             K=K_rows,
             X_CW=np.ascontiguousarray(X_WC.inverse().GetAsMatrix4()),
             width=width,
@@ -411,12 +327,35 @@ def _checked_camera(
             far_plane=far,
             eps2d=EPS2D,
             max_depth=max_depth,
-            merged_spread=merged,
+            merged_spread=merged_spread,
             antialiased=scene._antialiased,
             **lens,
         )
-
-    return make
+        cameras.append(camera)
+    # Environments follow.
+    skies = [isinstance(background, EnvironmentMap) for background in backgrounds]
+    colors = [BLACK if sky else color for color, sky in zip(backgrounds, skies, strict=True)]
+    for color in colors:
+        valid = len(color) == 3 and np.isfinite(color).all()
+        require(valid, "background", "3 finite numbers", list(color))
+    images = {
+        name: np.empty((*shape, *((num_rows, width) if name in names else (0, 0)), n), np.float32)
+        for name, n in _CHANNELS.items()
+    }
+    drawn = {name: image if name in names else None for name, image in images.items()}
+    draw(cameras, np.array(colors, np.float32).reshape(-1, 3), drawn)
+    view = RenderedView(images["color"], images["depth"][..., 0], images["alpha"][..., 0])
+    if distortion is None and not any(skies):
+        return view
+    slopes = pixel_slopes(distortion, K, width, height)[first:last]
+    hidden = np.isnan(slopes[..., 0])
+    for name in names:
+        images[name][..., hidden, :] = 0.0
+    for i, background in enumerate(backgrounds):
+        if skies[i] and view.color.size:
+            part = RenderedView(*(image[i] for image in view)) if shape else view
+            part.color[:] = put_behind(part, background, slopes, X_WCs[i]).color
+    return view
 
 
 def bake(scene: BakedScene | GaussianScene) -> BakedScene:

@@ -17,8 +17,8 @@ from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.readers import readable, require_readable_size
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.packed_splats import Arrays, joined, moved
-from splatpilot.systems.splats.scene import MAX_DEGREE, GaussianScene, color_to_sh
+from splatpilot.systems.splats.packed_splats import Arrays, moved
+from splatpilot.systems.splats.scene import MAX_DEGREE, GaussianScene, color_to_sh, concatenated
 
 _EXTENSION = "KHR_gaussian_splatting"
 _HARMONICS = [f"SH_DEGREE_{d}_COEF_{n}" for d in range(MAX_DEGREE + 1) for n in range(2 * d + 1)]
@@ -51,7 +51,7 @@ def unpack_gltf(path: Path) -> Arrays:
             for primitive in document["meshes"][mesh]["primitives"]
             if _EXTENSION in primitive.get("extensions", {})
         ]
-        return joined(parts)
+        return concatenated(parts)
 
 
 def _open(content: bytes) -> tuple[dict[str, Any], bytes]:
@@ -229,7 +229,7 @@ def unpack_usd(path: Path) -> tuple[Arrays, float, bool]:
             X = np.array(transforms.GetLocalToWorldTransform(prim)).T  # USD's vectors are rows
             parts.append(moved(_unpack_prim(prim, first), X))
         meters = float(UsdGeom.GetStageMetersPerUnit(stage))
-        return joined(parts), meters, UsdGeom.GetStageUpAxis(stage) == "Y"
+        return concatenated(parts), meters, UsdGeom.GetStageUpAxis(stage) == "Y"
 
 
 def _unpack_prim(prim: Any, time: Any) -> Arrays:

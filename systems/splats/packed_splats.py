@@ -37,16 +37,6 @@ def insert_largest(small: NDArray, index: NDArray) -> NDArray[np.float64]:
     return quats
 
 
-def joined(parts: list[Arrays]) -> Arrays:
-    """Concatenates Gaussians; lower degrees of spherical harmonics are padded with zeros."""
-    count = max((part["sh"].shape[1] for part in parts), default=1)
-    padded = [
-        part | {"sh": np.pad(part["sh"], ((0, 0), (0, count - part["sh"].shape[1]), (0, 0)))}
-        for part in parts
-    ]
-    return {name: np.concatenate([part[name] for part in padded]) for name in padded[0]}
-
-
 def moved(arrays: Arrays, X: NDArray[np.float64]) -> Arrays:
     """Returns Gaussians under an affine transform (4, 4) that does not mirror."""
     M = X[:3, :3]

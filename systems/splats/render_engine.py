@@ -47,6 +47,7 @@ from splatpilot.systems.splats.baked_scene import (
     bake,
     placed_together,
 )
+from splatpilot.systems.splats.lens import pixel_slopes
 from splatpilot.systems.splats.moving_bodies import MovingObstacles
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import (
@@ -72,9 +73,8 @@ _LIGHTS = [
 def gaussian_properties(
     gaussians: GaussianScene, label: RenderLabel | None = None
 ) -> PerceptionProperties:
-    """Returns properties of a geometry that a `SplatRenderEngine` draws as Gaussians.
-
-    Only other renderers draw the geometry's shape.
+    """Returns properties of a geometry that a `SplatRenderEngine` draws as Gaussians, others by its
+    shape.
 
     Args:
         gaussians: in the geometry's frame.
@@ -142,22 +142,18 @@ class SplatRenderEngine(RenderEngine):
     the cameras of `RgbdSensor`. The frame of the Gaussians is SceneGraph's world frame.
 
     Geometries with `gaussian_properties` are drawn as Gaussians at their poses, and not at all
-    beyond 1e8 m. A second engine with the same camera renders the shapes. Per pixel, with its
-    color c and depth d (infinite without a shape) and the Gaussians' color C, alpha A and median
-    depth D:
+    beyond 1e8 m. A second engine renders the shapes. With a pixel's shape, of color c and depth d
+    (background and infinite without one), and color C, alpha A and median depth D of Gaussians:
 
-    - color is c if d <= D, else C + (1 - A) c, with c that of the background or environment where
-      there is no shape;
+    - color is c if d <= D, else C + (1 - A) c;
     - depth is min(d, D), planar z in meters, 0 nearer than the camera's depth range and infinity
       beyond it; d if the Gaussians have no surface;
     - labels are those of the shapes if d <= D or there is no D, else of the body of
       Gaussians, else `RenderLabel.kUnspecified`.
 
-    A pixel has one D: a shape between two translucent layers of Gaussians is drawn before or behind
-    both. Gaussians cast no shadows on shapes, nor shapes on Gaussians.
-
-    Drake copies engines; copies share the scene. The last view is cached, so that all images of one
-    camera cost one rendering.
+    A shape between two translucent layers of Gaussians is drawn before or behind both. Shapes and
+    Gaussians cast no shadows on each other. The last view is cached, so that all images of one
+    camera cost one rendering. Copies share the scene.
     """
 
     def __init__(
@@ -169,7 +165,6 @@ class SplatRenderEngine(RenderEngine):
         """Creates the engine of the shapes, and a SceneGraph for it.
 
         Args:
-            scene: Gaussians, baked unless they are; a baked scene is held by reference.
             shapes: engine of the shapes and the background, copied; RenderEngineVtk if None, which
                 needs an OpenGL that works without a display (Debian: libegl1 libegl-mesa0
                 libgl1-mesa-dri libglib2.0-0 libx11-6 libsm6).
@@ -185,10 +180,12 @@ class SplatRenderEngine(RenderEngine):
             params = RenderEngineVtkParams(default_clear_color=color, lights=_LIGHTS)
             shapes = MakeRenderEngineVtk(params)
         # A separate SceneGraph: only SceneGraph moves the geometries of an engine.
-        scene_graph = SceneGraph()
-        scene_graph.AddRenderer(_SHAPES, shapes)
-        self._share(bake(scene), environment, scene_graph)
-        self._source = scene_graph.RegisterSource(_SHAPES)
+        self._scene_graph = SceneGraph()
+        self._scene_graph.AddRenderer(_SHAPES, shapes)
+        self._source = self._scene_graph.RegisterSource(_SHAPES)
+        self._scene, self._environment = bake(scene), environment
+        self._context: Context | None = None  # stale after registration and removal
+        self._last_view: tuple[bytes, RenderedView] | None = None
         self._frames: dict[GeometryId, FrameId] = {}  # of every geometry ever registered
         self._X_WG: dict[FrameId, RigidTransform] = {}
         self._geometries: dict[GeometryId, GeometryId] = {}  # to that in _scene_graph
@@ -197,25 +194,13 @@ class SplatRenderEngine(RenderEngine):
         self._body_poses: dict[GeometryId, RigidTransform] = {}
         self._X_WC = RigidTransform()
 
-    def _share(
-        self, scene: BakedScene, environment: EnvironmentMap | None, scene_graph: SceneGraph
-    ) -> None:
-        self._scene, self._environment = scene, environment
-        self._scene_graph = scene_graph
-        self._context: Context | None = None  # stale after registration and removal
-        self._last_view: tuple[bytes, RenderedView] | None = None
-
     def __deepcopy__(self, memo: dict) -> "SplatRenderEngine":
         copy = type(self).__new__(type(self))
         RenderEngine.__init__(copy)
-        scene_graph = cast(SceneGraph, self._scene_graph.Clone())
-        copy._share(self._scene, self._environment, scene_graph)
-        copy._source = self._source
-        copy._frames = dict(self._frames)
-        copy._X_WG = dict(self._X_WG)
-        copy._geometries = dict(self._geometries)
-        copy._bodies, copy._body_poses = dict(self._bodies), dict(self._body_poses)
-        copy._X_WC = self._X_WC
+        for name, value in vars(self).items():
+            setattr(copy, name, dict(value) if isinstance(value, dict) else value)
+        copy._scene_graph = cast(SceneGraph, self._scene_graph.Clone())
+        copy._context = copy._last_view = None
         # Drake does not copy the list of geometries with poses to update of a Python engine; only
         # registration makes one. DoRegisterVisual ignores geometries that the copy already has.
         inspector = self._scene_graph.model_inspector()
@@ -288,10 +273,9 @@ class SplatRenderEngine(RenderEngine):
         shape_in_front = shape_depth <= view.depth  # (H, W)
         behind = behind[..., :3].astype(np.float32) / 255
         if self._environment is not None:
-            rows, columns = np.nonzero(np.isinf(shape_depth))
-            K = camera.core().intrinsics().intrinsic_matrix()
-            v_W = pixel_rays(K, rows, columns, self._X_WC)
-            behind[rows, columns] = self._environment.color(v_W)
+            sky, (K, width, height, *_) = np.isinf(shape_depth), self._camera(camera.core())[0]
+            v_W = pixel_rays(pixel_slopes(None, K, width, height)[sky], self._X_WC)
+            behind[sky] = self._environment.color(v_W)
         blended = view.color + (1 - view.alpha[..., None]) * behind
         color = np.where(shape_in_front[..., None], behind, blended)
         out = np.asarray(color_image_out.mutable_data)  # (H, W, 4)

@@ -27,10 +27,9 @@ def color_to_sh(color: ArrayLike) -> NDArray[Any]:
 
 
 def sh_basis(directions: ArrayLike, degree: int) -> NDArray[np.float64]:
-    """Evaluates the real spherical harmonics of degrees 0 to `degree`, (..., (degree + 1)^2).
+    """Evaluates the real spherical harmonics (..., (degree + 1)^2) at unit `directions` (..., 3).
 
-    At unit `directions` (..., 3), in the order and signs of 3D Gaussian splatting: with the
-    Condon-Shortley phase (Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2013).
+    With the Condon-Shortley phase (Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2013).
     """
     require(degree in range(MAX_DEGREE + 1), "the degree of spherical harmonics", "0 to 3", degree)
     x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
@@ -67,11 +66,10 @@ def harmonic_degree(coefficients: int) -> int:
 
 
 def sh_rotations(R: ArrayLike, degree: int) -> list[NDArray[np.float64]]:
-    """Returns, for l = 0 to `degree`, the (2l+1, 2l+1) matrix that rotates degree-l coefficients.
+    """Returns, for l = 0 to `degree`, the (2l+1, 2l+1) matrix M that rotates degree-l coefficients.
 
-    With `R` = R_WO, shape (3, 3), and coefficients c of a function f of directions in frame O,
-    ``M @ c`` are those of the same function in W: f_W(d_W) = f_O(R^T d_W). Samples of the basis in
-    2l + 1 or more directions determine M exactly.
+    M c are the coefficients of f_W(d_W) = f_O(R^T d_W), with `R` = R_WO (3, 3) and c those of f_O.
+    Samples of the basis in 2l + 1 or more directions determine M exactly.
     """
     R = np.asarray(R, dtype=np.float64)
     count = 32  # spread directions; 7 would do, more condition the solve
@@ -105,7 +103,9 @@ def require_valid(
         require(False, f"{name}[{', '.join(map(str, first))}]", condition, got, remedy)
 
 
-_SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (-1, 3)}
+_SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": ("K", 3)}
+ARRAYS = tuple(_SHAPES)
+"""The arrays of a scene, in the order of its arguments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +114,8 @@ class GaussianScene:
 
     Gaussian i has the covariance R(quats[i]) diag(scales[i])^2 R(quats[i])^T about means[i], and
     along the unit direction d (from camera to Gaussian) the color
-    ``max(0, 0.5 + sum_k basis_k(d) sh[i, k])``, see `sh_basis`. Arrays become float32 and
-    contiguous; those that already are, are shared, so do not write into them. Quaternions are
-    normalized.
+    ``max(0, 0.5 + sum_k basis_k(d) sh[i, k])``, see `sh_basis`. Contiguous float32 arrays are
+    shared; do not write into them. Quaternions are normalized.
     """
 
     means: NDArray[np.float32]  # (N, 3) [m], centers
@@ -134,16 +133,15 @@ class GaussianScene:
         for name, columns in _SHAPES.items():
             array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
             fits = array.ndim == 1 + len(columns) and all(
-                want in (-1, have) for want, have in zip(columns, array.shape[1:], strict=True)
+                want in ("K", have) for want, have in zip(columns, array.shape[1:], strict=True)
             )
-            expected = ", ".join(["N", *("K" if n == -1 else str(n) for n in columns)])
-            require(fits, name, f"of shape ({expected})", array.shape)
+            require(fits, name, f"of shape ({', '.join(map(str, ('N', *columns)))})", array.shape)
             object.__setattr__(self, name, array)
-        lengths = {name: len(getattr(self, name)) for name in _SHAPES}
+        lengths = {name: len(getattr(self, name)) for name in ARRAYS}
         require(len(set(lengths.values())) == 1, "arrays", "of one length", lengths)
         harmonic_degree(self.sh.shape[1])
         remedy = "remove this Gaussian or repair its file"
-        for name in _SHAPES:
+        for name in ARRAYS:
             array = getattr(self, name)
             require_valid(np.isfinite(array), name, array, "finite", remedy)
         remedy = "take the exponential of stored logarithms"
@@ -212,42 +210,31 @@ class GaussianScene:
             means=(self.means @ R_WO.T + X_WO.translation()).astype(np.float32),
             quats=quats.astype(np.float32),
             sh=rotated_sh(self.sh, R_WO).astype(np.float32),
-            origin=_vector(R_WO @ self.origin),
+            origin=tuple((R_WO @ self.origin).tolist()),
         )
 
     def scaled_by(self, factor: float) -> GaussianScene:
         """Returns these Gaussians with all lengths from the origin times `factor`."""
         scale = np.float32(factor)
-        means, scales = self.means * scale, self.scales * scale
-        origin = _vector(factor * np.array(self.origin))
-        return replace(self, means=means, scales=scales, origin=origin)
+        origin = tuple((factor * np.array(self.origin)).tolist())
+        return replace(self, means=self.means * scale, scales=self.scales * scale, origin=origin)
 
     def merged_with(self, other: GaussianScene) -> GaussianScene:
-        """Returns this scene with the Gaussians of another in the same frame.
-
-        The lower of the two degrees of spherical harmonics is padded with zeros. The result is
-        `antialiased` as this scene is.
-        """
-        merged = concatenated([self, other])
-        return replace(self, **dict(zip(ARRAYS, merged, strict=True)))
+        """Returns this scene with the Gaussians of another in its frame; `antialiased` stays."""
+        return replace(self, **concatenated([self, other]))
 
 
-ARRAYS = ("means", "quats", "scales", "opacities", "sh")
-"""The arrays of a scene, in the order of its arguments."""
-
-
-def concatenated(parts: Sequence[Any]) -> list[NDArray[Any]]:
-    """Concatenates the `ARRAYS` of parts; lower degrees of spherical harmonics are padded with
-    zeros."""
-    count = max(part.sh.shape[1] for part in parts)
-    padded = [np.pad(part.sh, ((0, 0), (0, count - part.sh.shape[1]), (0, 0))) for part in parts]
-    plain = [np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS[:-1]]
-    return [*plain, np.concatenate(padded)]
-
-
-def _vector(p: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = p.tolist()
-    return x, y, z
+def concatenated(parts: Sequence[Any]) -> dict[str, NDArray[Any]]:
+    """Concatenates the `ARRAYS` of scenes or dictionaries; lower degrees of spherical harmonics are
+    padded with zeros."""
+    rows = [
+        part if isinstance(part, dict) else {name: getattr(part, name) for name in ARRAYS}
+        for part in parts
+    ]
+    count = max(row["sh"].shape[1] for row in rows)
+    pads = [((0, 0), (0, count - row["sh"].shape[1]), (0, 0)) for row in rows]
+    padded = [row | {"sh": np.pad(row["sh"], pad)} for row, pad in zip(rows, pads, strict=True)]
+    return {name: np.concatenate([row[name] for row in padded]) for name in ARRAYS}
 
 
 def choose_origin(positions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,8 +12,9 @@ from pydrake.systems import sensors
 from pydrake.systems.framework import DiagramBuilder
 
 from splatpilot.systems.collision.shapes import MovingSpheres
-from splatpilot.systems.splats.background import EnvironmentMap, pixel_rays
+from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians
+from splatpilot.systems.splats.lens import pixel_slopes
 from splatpilot.systems.splats.moving_bodies import Bodies, MovingObstacles
 from splatpilot.systems.splats.render_engine import (
     ObstacleGeometry,
@@ -175,7 +176,8 @@ def test_an_environment_is_behind_everything():
     engine = SplatRenderEngine(wall(-4.0), background=environment)
     add_box(engine, 3.0)
     rows, columns = np.array([CORNER[0], HEIGHT - 2]), np.array([CORNER[1], WIDTH - 2])
-    v_W = pixel_rays(INFO.intrinsic_matrix(), rows, columns, RigidTransform())
+    slopes = pixel_slopes(None, INFO.intrinsic_matrix(), WIDTH, HEIGHT)[rows, columns]
+    v_W = np.column_stack([slopes, np.ones(2)])
     seen = color(engine)
     np.testing.assert_allclose(seen[rows, columns, :3] / 255, environment.color(v_W), atol=0.01)
     assert is_green(seen[CENTER])
