@@ -347,11 +347,11 @@ def _record(name: str, entry: Entry, config: SceneSource, digest: list[str]) -> 
     )
 
 
-def feasible_seeds(config: SceneSource, scene: World, seeds: int = _SEEDS) -> tuple[int, str]:
+def feasible_seeds(config: SceneSource, scene: World) -> tuple[int, str]:
     """Counts the seeds from 0 whose start and goal a search on the distance field connects, and
     returns the reason of the first that is not one of them."""
     count, reason = 0, ""
-    for seed in Progress(range(seeds), "starts and goals", unit="seed", leave=False):
+    for seed in Progress(range(_SEEDS), "starts and goals", unit="seed", leave=False):
         try:
             world = draw_ends(config, scene, seed)
             state = sample_initial_state(Scenario(seed=seed), world)

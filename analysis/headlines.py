@@ -339,7 +339,7 @@ def _forest_views(mode: str, width: int, height: int, count: int, device: str) -
     return scene_tensors(world.gaussians, *views, device) | {"render_mode": mode}
 
 
-def gpu_images(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
+def gpu_images(effort: Effort) -> Iterator[Headline]:
     """Measures batches of images of P02 by gsplat, which has no median depth."""
     import torch
 
@@ -349,7 +349,7 @@ def gpu_images(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     counts = sorted({1, 16, 256, effort.vehicles})
     for name, (mode, width, height, required) in kinds.items():
         for count in counts:
-            given = _forest_views(mode, width, height, count, device)
+            given = _forest_views(mode, width, height, count, "cuda")
 
             def render(given: Mapping[str, Any] = given) -> None:
                 rasterize(**given)[1][0, 0, 0].cpu()  # waits for the device
@@ -374,7 +374,7 @@ def gpu_agreement(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     yield Headline("GPU and CPU, values that differ by 1e-3", share, "%", max=0.1)
 
 
-def gpu_reconstruct(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
+def gpu_reconstruct(effort: Effort) -> Iterator[Headline]:
     """Reconstructs and measures TartanAir's hospital."""
     from splatpilot.analysis.reconstruction.measure_scene import make_scene
     from splatpilot.training.reconstruction.config import ReconstructConfig
@@ -382,7 +382,7 @@ def gpu_reconstruct(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     data = data_folder()
     if data is None:
         raise ValueError("SPLATPILOT_DATA must be set to the folder of tartanair/hospital")
-    config, capture = ReconstructConfig(device=device), data / "tartanair" / "hospital"
+    config, capture = ReconstructConfig(device="cuda"), data / "tartanair" / "hospital"
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
         _, metrics = make_scene(capture=capture, out=Path(folder) / "scene", config=config)
@@ -390,7 +390,7 @@ def gpu_reconstruct(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     yield Headline("GPU, PSNR of the hospital", metrics.mean("psnr_db") or np.nan, "dB")
 
 
-def gpu_student(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
+def gpu_student(effort: Effort) -> Iterator[Headline]:
     """Trains a student of depth from scratch, on a small corpus."""
     import torch
 
@@ -403,16 +403,13 @@ def gpu_student(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
         corpus = Path(folder) / "corpus"
         collect.run(out=corpus, worlds=2, config=CorpusConfig(flights=1))
         config = StudentDepthTraining(
-            corpora=[str(corpus)], device=device, pretrained=False, frozen=0, batch=256
+            corpora=[str(corpus)], device="cuda", pretrained=False, frozen=0, batch=256
         )
         trainer = StudentTrainer(config)
         optimizer = torch.optim.AdamW(trainer.network.parameters())
 
-        def learn() -> None:
-            for _ in range(effort.updates):
-                step_optimizer(trainer.losses, trainer.network, optimizer, 1.0)
-
-        seconds = wall_seconds(learn)
+        learn = partial(step_optimizer, trainer.losses, trainer.network, optimizer, 1.0)
+        seconds = timeit.timeit(learn, number=effort.updates)
     rate = effort.updates * config.batch / seconds
     yield Headline(f"GPU, {effort.updates} updates of a student", rate, "samples/s")
 

@@ -120,10 +120,10 @@ def shortest_length(lengths: TimeOfArrival, p_WS: np.ndarray, goal_radius: float
 
 def fly_rollouts(
     flights: list[tuple[RolloutSpec, str]],
-    modules: Sequence[str] = (),
-    policies: Sequence[str] = (),
-    changed: Mapping[str, ScenarioVariant] = {},
-    systems: Mapping[str, MakeSystem] = {},
+    modules: Sequence[str],
+    policies: Sequence[str],
+    changed: Mapping[str, ScenarioVariant],
+    systems: Mapping[str, MakeSystem],
 ) -> list[Rollout | Fault]:
     """Flies flights, with their scenarios as YAML, up to the first fault.
 

@@ -26,6 +26,7 @@ from splatpilot.training.corpus.library import PROCEDURAL
 Row = dict[str, Any]
 """The specification and metrics of a flight, or a row of a table."""
 
+_CONFIDENCE = 0.95
 _RESAMPLES = 9999
 _MAX_EXACT = 17  # scenarios with all 2^n signs; for more, as many random ones
 
@@ -37,12 +38,12 @@ class Interval(NamedTuple):
     upper: float
 
 
-def wilson_interval(successes: float, flights: float, confidence: float = 0.95) -> Interval:
+def wilson_interval(successes: float, flights: float) -> Interval:
     """Returns the score interval of a success rate (E. B. Wilson, 1927) of independent flights, see
     `effective_flights`; [0, 1] without flights."""
     if flights == 0:
         return Interval(0.0, 1.0)
-    p, z2 = successes / flights, float(norm.ppf((1 + confidence) / 2)) ** 2
+    p, z2 = successes / flights, float(norm.ppf((1 + _CONFIDENCE) / 2)) ** 2
     center = (p + z2 / (2 * flights)) / (1 + z2 / flights)
     half = math.sqrt(z2 * (p * (1 - p) + z2 / (4 * flights)) / flights) / (1 + z2 / flights)
     lower, upper = max(center - half, 0.0), min(center + half, 1.0)
@@ -67,9 +68,7 @@ def effective_flights(successes: ArrayLike, flights: ArrayLike) -> float:
     return float(np.clip(rate * (1 - rate) / between, 1.0, total)) if between else float(total)
 
 
-def cluster_interval(
-    successes: ArrayLike, flights: ArrayLike, confidence: float = 0.95
-) -> Interval:
+def cluster_interval(successes: ArrayLike, flights: ArrayLike) -> Interval:
     """Returns the percentile interval of a success rate by a bootstrap over scenarios (S,).
 
     It is [0, 1] for fewer than two scenarios. If all have the same rate, it is Wilson's with each
@@ -79,10 +78,10 @@ def cluster_interval(
     if len(k) < 2:
         return Interval(0.0, 1.0)
     if np.ptp(k / n) == 0:
-        return wilson_interval(float(k.sum() / n.sum()) * len(k), len(k), confidence)
+        return wilson_interval(float(k.sum() / n.sum()) * len(k), len(k))
     drawn = np.random.default_rng(0).integers(len(k), size=(_RESAMPLES, len(k)))
     rates = k[drawn].sum(axis=1) / n[drawn].sum(axis=1)
-    lower, upper = np.quantile(rates, [(1 - confidence) / 2, (1 + confidence) / 2])
+    lower, upper = np.quantile(rates, [(1 - _CONFIDENCE) / 2, (1 + _CONFIDENCE) / 2])
     return Interval(float(lower), float(upper))
 
 
