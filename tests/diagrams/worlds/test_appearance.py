@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from splatpilot.diagrams.worlds.appearance import (
     draw_appearance,
@@ -61,9 +62,7 @@ def test_exposure_is_in_stops(scene):
 
 
 def test_hue_turns_colors_and_leaves_grays(scene):
-    gray_axis = np.ones((3, 3)) / 3
-    turn = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)
-    hue = gray_axis - (np.eye(3) - gray_axis) / 2 + np.sqrt(3) / 2 * turn
+    hue = Rotation.from_rotvec(2 / 3 * np.pi * np.ones(3) / np.sqrt(3)).as_matrix()
     look = replace(draw(0, strength=0.0), mixing=hue.astype(np.float32))
     colors = [[0.8, 0.1, 0.1], [0.4, 0.4, 0.4]]
     two = GaussianScene.from_colors(

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
+from room import pinhole_rays
 
 from splatpilot.diagrams.worlds import mesh_renderer
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, build
@@ -45,11 +46,9 @@ def test_mesh_lies_on_the_surfaces_and_looks_like_the_gaussians(
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     # All light is baked in; lamps add only gloss.
     monkeypatch.setattr(mesh_renderer, "_LAMPS", [((0, 0, -1), 0.0)])
-    color, depth = mesh_renderer.MeshRenderer(path, "y", (0, 0, 0)).render(
-        X_WC, K, WIDTH, HEIGHT, (0.2, 50.0)
-    )
-    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], axis=-1)
+    renderer = mesh_renderer.MeshRenderer(path, "y", (0, 0, 0))
+    color, depth = renderer.render(X_WC, K, WIDTH, HEIGHT, (0.2, 50.0))
+    rays = np.dstack([pinhole_rays(K, WIDTH, HEIGHT), np.ones((HEIGHT, WIDTH))])
     seen = np.isfinite(depth)
     p_WQ = X_WC.multiply((rays[seen] * depth[seen, None]).T).T
     distance = spec.distance_field.distance(p_WQ)
@@ -77,8 +76,7 @@ def test_file_is_whole_and_the_same_twice(spec, tmp_path):
     document = json.loads(one.read_text())
     uris = [part["uri"] for kind in ("buffers", "images") for part in document[kind]]
     assert uris and all(uri.startswith("data:") for uri in uris)
-    position = document["accessors"][
-        document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
-    ]
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    position = document["accessors"][attributes["POSITION"]]
     np.testing.assert_allclose(position["min"], [-28, 0, -30.5], atol=1e-6)
     assert position["max"][1] == pytest.approx(3.8, abs=0.02)

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from room import pinhole_rays
 
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
@@ -39,8 +40,7 @@ def test_drawn_surfaces_are_those_of_the_distance_field():
     X_WC = look_along(world.p_WS, np.arctan2(forward[1], forward[0]), 0.0)
     K = np.array([[60.0, 0, 60], [0, 60, 45], [0, 0, 1]])
     view = world.baked.render(K, 120, 90, X_WC, near=0.05)
-    v, u = np.mgrid[:90, :120] + 0.5
-    rays = np.stack([(u - 60) / 60, (v - 45) / 60, np.ones_like(u)], axis=-1)
+    rays = np.dstack([pinhole_rays(K, 120, 90), np.ones((90, 120))])
     q = X_WC.multiply((rays * view.depth[..., None]).reshape(-1, 3).T).T
     off = np.abs(world.distance_field.distance(np.clip(q, lower, upper)))
     assert view.alpha.min() > 0.9  # a closed room has no holes

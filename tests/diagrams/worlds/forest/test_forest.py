@@ -55,10 +55,9 @@ def test_trunks_are_as_configured_and_let_the_vehicle_through_at_every_height(ki
 
 def test_everything_drawn_in_the_volume_is_solid(world):
     p, field = world.gaussians.means.astype(float), world.distance_field
-    inside = ((p >= field.lower_W) & (p <= field.upper_W)).all(axis=1)
-    distance = np.abs(field.distance(p[inside]))
-    assert distance.max() < 0.07
-    assert np.quantile(distance, 0.95) < 0.04
+    distance = np.abs(field.distance(p))
+    distance = distance[np.isfinite(distance)]
+    assert distance.max() < 0.07 and np.quantile(distance, 0.95) < 0.04
 
 
 def test_leaves_around_the_volume_stay_out_of_it(world):

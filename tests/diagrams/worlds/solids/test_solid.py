@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
+from room import pinhole_rays
 
 from splatpilot.diagrams.worlds.solids import solid
 from splatpilot.systems.collision import shapes
@@ -40,13 +41,10 @@ def test_faces_cover_the_surface_and_look_outwards(kind):
 
 @pytest.mark.parametrize("material", solid.MATERIALS)
 def test_materials_have_colors_and_something_to_see(material):
-    rng = np.random.default_rng(1)
-    uv = rng.uniform(0, 2, (4000, 2))
+    uv = np.random.default_rng(1).uniform(0, 2, (4000, 2))
     ground = material in ("grass", "paving", "forest_floor")
-    shape, height = (
-        (shapes.HalfSpace([0.0, 0, 1], 0.0), 0 * uv[:, 0]) if ground else (BOX, 3 + uv[:, 1])
-    )
-    p = np.column_stack([uv, height])
+    shape = shapes.HalfSpace([0.0, 0, 1], 0.0) if ground else BOX
+    p = np.column_stack([uv, 0 * uv[:, 0] if ground else 3 + uv[:, 1]])
     colors, again, other = (solid.Solid(shape, material, seed).albedo(uv, p) for seed in (3, 3, 5))
     assert colors.shape == (4000, 3)
     assert np.min(colors) > -0.05 and np.max(colors) < 1.3
@@ -93,19 +91,18 @@ def test_outlines_are_those_of_the_solid(shape, material, within):
     bounds = np.full(3, -9.0), np.full(3, 9.0)
     solids = [solid.Solid(shape, material)]
     spec = solid.WorldSpec("outline", *bounds, solids, *bounds, light=lambda _: Even())
-    scene = BakedScene(solid.draw(spec, solids, Even()))
+    scene, union = BakedScene(solid.draw(spec, solids, Even())), shapes.ShapeUnion.of([shape])
     K = np.array([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
-    v, u = np.mgrid[:SIZE, :SIZE] + 0.5
-    rays_C = np.stack([u - SIZE / 2, v - SIZE / 2, np.full_like(u, FOCAL)], -1).reshape(-1, 3)
+    rays_C = np.dstack([pinhole_rays(K, SIZE, SIZE), np.ones((SIZE, SIZE))]).reshape(-1, 3)
     rays_C /= np.linalg.norm(rays_C, axis=1, keepdims=True)
     drawn = covered = rim = 0
     for azimuth in np.linspace(0, 2 * np.pi, 5, endpoint=False):
         X_WC = look_along(-AWAY * np.array([np.cos(azimuth), np.sin(azimuth), 0]), azimuth, 0.0)
         rays_W, p_WQ = rays_C @ X_WC.rotation().matrix().T, X_WC.translation()
         for _ in range(40):  # steps along the rays to the surface
-            distance = shapes.ShapeUnion.of([shape]).distance(p_WQ + np.zeros_like(rays_W))
+            distance = union.distance(p_WQ + np.zeros_like(rays_W))
             p_WQ = p_WQ + np.minimum(distance, 1.0)[:, None] * rays_W
-        inside = (shapes.ShapeUnion.of([shape]).distance(p_WQ) < 1e-3).reshape(SIZE, SIZE)
+        inside = (union.distance(p_WQ) < 1e-3).reshape(SIZE, SIZE)
         drawn += int((scene.render(K, SIZE, SIZE, X_WC).depth > 0).sum())
         covered += int(inside.sum())
         rim += int((inside[1:] ^ inside[:-1]).sum() + (inside[:, 1:] ^ inside[:, :-1]).sum())

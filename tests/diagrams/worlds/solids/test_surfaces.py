@@ -8,8 +8,6 @@ from scipy.spatial.transform import Rotation
 from splatpilot.diagrams.worlds.solids import surfaces
 
 P_A, P_B = np.array([1.0, 2.0, -0.5]), np.array([1.4, 1.8, 4.0])
-
-
 AXIS = (P_B - P_A) / np.linalg.norm(P_B - P_A)
 
 
@@ -32,7 +30,7 @@ def test_patches_of_a_tube_lie_on_the_cylinder_or_cone(taper):
 
 def test_patches_of_a_sphere_lie_on_it():
     surfels = surfaces.sphere((1, 2, 3), 0.7, 0.1)
-    np.testing.assert_allclose(surfels.p, np.array([1, 2, 3]) + 0.7 * surfels.n, atol=1e-12)
+    np.testing.assert_allclose(surfels.p, [1, 2, 3] + 0.7 * surfels.n, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(surfels.n, axis=1), 1)
     np.testing.assert_allclose(np.sum(surfels.t * surfels.n, axis=1), 0, atol=1e-12)
 
