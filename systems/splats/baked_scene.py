@@ -16,7 +16,7 @@ from splatpilot.systems.splats.background import (
     RenderedView,
     put_behind,
 )
-from splatpilot.systems.splats.lens import Distortion, native_lens, pixel_slopes
+from splatpilot.systems.splats.lens import NUM_RADIAL, Distortion, native_lens, pixel_slopes
 from splatpilot.systems.splats.scene import ARRAYS, GaussianScene, concatenated, harmonic_degree
 
 if TYPE_CHECKING:
@@ -310,7 +310,8 @@ def _render_views(
     if distortion is not None:
         whole = native_lens(distortion, K, width, height)
         part = native_lens(distortion, K_rows, width, num_rows)
-        lens = whole.with_rows(part)._asdict()
+        model = 1 + list(NUM_RADIAL).index(distortion.model)
+        lens = {"distortion": model, "lens": np.append(whole[:13], part[13:])}
     scenes, X_WCs, backgrounds = views
     cameras = []
     for scene, X_WC in zip(scenes, X_WCs, strict=True):

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, wraps
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -132,18 +132,6 @@ class Distortion(Config):
         return np.where(desired < radii[-1], share, np.nan)[..., None] * points
 
 
-class NativeLens(NamedTuple):
-    """A lens before an image, as the renderer takes it."""
-
-    distortion: int
-    # (17,): radial 6, tangential 2, limit^2, min and max slopes of the image and of its rows
-    lens: "NDArray[np.float64]"
-
-    def with_rows(self, rows: "NativeLens") -> "NativeLens":
-        """Returns this lens for a camera that shows the rows of another one alone."""
-        return self._replace(lens=np.append(self.lens[:13], rows.lens[13:]))
-
-
 type _Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy
 
 
@@ -165,8 +153,9 @@ def _cached[T](maxsize: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
 @_cached(512)  # each band of a rolling shutter has one
 def native_lens(
     distortion: Distortion, intrinsics: _Intrinsics, width: int, height: int
-) -> NativeLens:
-    """Returns the lens of a camera with the intrinsics K (3, 3) [px] for `_native.render_baked`."""
+) -> "NDArray[np.float64]":
+    """Returns the renderer's numbers (17,) of a camera with the intrinsics K (3, 3) [px]: radial 6,
+    tangential 2, limit^2, min and max slopes of the image and, the same, of its rows."""
     fx, fy, cx, cy = intrinsics
     along = np.linspace(-1.0, 1.0, 257)
     edges = [(along, np.full(257, end)) for end in (-1.0, 1.0)]
@@ -184,7 +173,7 @@ def native_lens(
         min(distortion.limit**2, 1e12),
         *(*slopes.min(axis=0), *slopes.max(axis=0)) * 2,
     ]
-    return NativeLens(1 + list(NUM_RADIAL).index(distortion.model), np.array(numbers))
+    return np.array(numbers)
 
 
 @_cached(8)

@@ -92,8 +92,7 @@ class Bodies(SpheresInTime):
 
 
 class MovingBodies(LeafSystem):
-    """Outputs the bodies that move among the Gaussians of a scene, for cameras, distances and
-    planners.
+    """Outputs the bodies that move in a scene, for cameras, distances and planners.
 
     .. pydrake_system::
 
@@ -123,8 +122,7 @@ class MovingBodies(LeafSystem):
         """Declares a body, until the Diagram is built, and returns its port of poses X_WO.
 
         Args:
-            name: of the port.
-            gaussians: of the body in its frame O.
+            gaussians: in the frame O of the body.
             radius: [m] of the sphere about the origin of O that vehicles collide with; 0 for none.
         """
         require(0.0 <= radius < np.inf, "radius", "in [0, inf) m", radius)

@@ -1,7 +1,7 @@
 """Cameras in Gaussian scenes."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -24,19 +24,14 @@ from pydrake.systems.sensors import (
 
 from splatpilot.systems.common.drake import (
     input_port,
-    optional_value,
+    optional_input,
     output_port,
     weak_callback,
 )
 from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.sensing.noise import color_of_light, light_of_color
 from splatpilot.systems.splats.background import BLACK, Background, RenderedView
-from splatpilot.systems.splats.baked_scene import (
-    NO_GAUSSIANS,
-    BakedScene,
-    PlacedGaussians,
-    bake,
-)
+from splatpilot.systems.splats.baked_scene import NO_GAUSSIANS, BakedScene, bake
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 from splatpilot.systems.splats.moving_bodies import Bodies
 from splatpilot.systems.splats.scene import GaussianScene
@@ -51,10 +46,8 @@ def color_pixels(color: NDArray) -> NDArray[np.uint8]:
 def ranged_depth(
     depth: NDArray[np.float32], min_depth: float, max_depth: float
 ) -> NDArray[np.float32]:
-    """Converts planar depth (H, W) [m], 0 without a surface, to that of Drake's cameras.
-
-    Nearer than `min_depth` reads 0; farther than `max_depth` and without a surface, infinity.
-    """
+    """Converts planar depth (H, W) [m], 0 without a surface, to that of Drake's cameras: 0 nearer
+    than `min_depth`, infinity beyond `max_depth` and without a surface."""
     in_range = (depth > 0) & (depth <= max_depth)
     return np.where(in_range, np.where(depth < min_depth, np.float32(0), depth), np.inf)
 
@@ -102,11 +95,8 @@ def image_shift(X_WC0: RigidTransform, X_WC1: RigidTransform, focal: float) -> f
 def row_bands(
     X_WC0: RigidTransform, X_WC1: RigidTransform, focal: float, height: int, min_count: int = 1
 ) -> list[tuple[int, int]]:
-    """Divides an image of a rolling shutter into bands of rows that render from one pose.
-
-    Returns the first row of each of at least `min_count` bands, and the row after its last; the
-    camera has the poses X_WC0 and X_WC1 at the first and the last row.
-    """
+    """Divides an image of a rolling shutter, from X_WC0 at the first row to X_WC1 at the last, into
+    at least `min_count` bands that render from one pose; returns first rows, and rows behind."""
     steps = image_shift(X_WC0, X_WC1, focal) / _MAX_STEP
     count = min(height, max(min_count, math.ceil(steps)))
     edges = np.linspace(0, height, count + 1).round().astype(int).tolist()
@@ -119,10 +109,8 @@ def blurred_light(
     X_CtCs: Sequence[RigidTransform],
     lens: Distortion | None = None,
 ) -> NDArray[np.float32]:
-    """Computes the mean light (H, W, 3) of an exposure from the view of the camera C in its middle.
-
-    The image is shifted along the motion of each pixel's surface, which is exact up to surfaces
-    that appear or vanish. Pixels without depth are far away.
+    """Computes the mean light (H, W, 3) of an exposure from the view of the camera C in its middle,
+    shifted along the motion of each pixel's surface; pixels without depth are far away.
 
     Args:
         X_CtCs: poses of C in the frames of the camera at the start and the end of the exposure.
@@ -174,11 +162,10 @@ class SplatCamera(LeafSystem):
             body_pose_in_world, image_time]
 
     `body_pose` is the pose X_WB of the body that carries the camera; the camera has the pose X_WC =
-    X_WB X_BC with x right, y down and z forward for all images. With a `readout`, a rolling
-    shutter, that is the pose at the last row, and `start_pose` X_WB at the first. With an
-    `exposure` they are the poses at its end and its beginning, and color images are the mean of the
-    light in between; depth is that in the middle. `moving` adds the Gaussians of `MovingBodies`.
-    `image_time` [s] is that of the capture.
+    X_WB X_BC with x right, y down and z forward. With a `readout`, a rolling shutter, that is the
+    pose at the last row, and `start_pose` X_WB at the first; with an `exposure`, at its end and its
+    beginning. Color images are the mean of the light in between; depth is that in the middle.
+    `moving` adds the Gaussians of `MovingBodies`. `image_time` [s] is that of the capture.
 
     Depth is planar z of the surface, the median depth of `rasterize`, in meters
     (`depth_image_32f`) or millimeters (`depth_image_16u`). As in Drake, nearer than `min_depth`
@@ -217,7 +204,7 @@ class SplatCamera(LeafSystem):
         exposure: float = 0.0,
         merged_spread: float = 0.0,
     ):
-        """Bakes the scene unless it is baked; see `BakedScene.render`.
+        """Bakes the scene unless it is baked; see `BakedScene.render` for further arguments.
 
         Args:
             camera_info, X_BC: defaults of the parameters: the intrinsics, and the pose of the
@@ -227,7 +214,6 @@ class SplatCamera(LeafSystem):
                 input port must be as old.
             readout: time between reading the first row and the last [s]; 0 reads all at once.
             exposure: time for which each row collects light [s]; images blur by motion.
-            merged_spread: see `BakedScene.render`.
         """
         super().__init__()
         valid, got = 0 <= min_depth < max_depth < np.inf, f"[{min_depth}, {max_depth}] m"
@@ -272,16 +258,12 @@ class SplatCamera(LeafSystem):
         # The indices: Drake would never free a system that keeps the entries themselves.
         self._color_index, self._depth_index = color_entry.cache_index(), depth_entry.cache_index()
         width, height = camera_info.width(), camera_info.height()
+        color, depth = {color_entry.ticket()}, {depth_entry.ticket()}
         for name, image, calc, prerequisites in (
-            ("color_image", ImageRgba8U, self._calc_color, {color_entry.ticket()}),
-            ("depth_image_32f", ImageDepth32F, self._calc_depth_32f, {depth_entry.ticket()}),
-            ("depth_image_16u", ImageDepth16U, self._calc_depth_16u, {depth_entry.ticket()}),
-            (
-                "label_image",
-                ImageLabel16I,
-                self._calc_label,
-                {depth_entry.ticket(), *tickets},
-            ),
+            ("color_image", ImageRgba8U, self._calc_color, color),
+            ("depth_image_32f", ImageDepth32F, self._calc_depth_32f, depth),
+            ("depth_image_16u", ImageDepth16U, self._calc_depth_16u, depth),
+            ("label_image", ImageLabel16I, self._calc_label, depth | tickets),
         ):
             self.DeclareAbstractOutputPort(
                 name,
@@ -329,36 +311,29 @@ class SplatCamera(LeafSystem):
         bodies: Bodies | None = None,
         X_WB_start: RigidTransform | None = None,
     ) -> RenderedView:
-        """Renders the view from body pose X_WB, before it becomes Drake images.
+        """Renders the view from body pose X_WB, with bodies as old as the images.
 
         Args:
-            bodies: drawn where they are as old as the images.
-            X_WB_start: pose at the beginning of the exposure of the first row, `readout` plus
-                `exposure` earlier.
+            X_WB_start: pose `readout` plus `exposure` earlier.
         """
         time = bodies.time if bodies else 0.0
         camera = CameraState(
             self._camera_info, self._X_BC, X_WB, time - self._age(time), X_WB_start, bodies
         )
-        return self._render(camera)
-
-    def _render(self, camera: CameraState) -> RenderedView:
         view = self._render_view(self._shutter(camera, 0.5))
         if self._num_exposures(camera) == 0:
             return view
         return view._replace(color=self._render_color(camera))
 
     def _render_view(self, camera: CameraState) -> RenderedView:
-        parts = self._render_instant(self._scene.render, camera, background=self._background)
-        return RenderedView(*parts)
+        return self._render_instant(self._scene.render, camera, background=self._background)
 
     def _render_color(self, camera: CameraState) -> NDArray[np.float32]:
         count, lights = self._num_exposures(camera), []
         if count == 0:
-            (color,) = self._render_instant(
+            return self._render_instant(
                 self._scene.render_color, self._shutter(camera, 0.5), background=self._background
             )
-            return color
         for k in range(count):
             first, middle, last = (self._shutter(camera, (k + s) / count) for s in (0.0, 0.5, 1.0))
             X_WC = middle.X_WB @ camera.X_BC
@@ -392,41 +367,32 @@ class SplatCamera(LeafSystem):
         time = camera.time - (1.0 - s) * self._exposure
         return camera._replace(X_WB=X_WBs[1], X_WB_start=start, time=time)
 
-    def _render_instant(
-        self, render: Callable[..., Any], camera: CameraState, **options: Any
-    ) -> list[NDArray[np.float32]]:
-        """Renders the bands of an image, or of a view of several, and joins them."""
-        bands = [
-            render(*view, **band, **self._options, **options) for view, band in self._bands(camera)
-        ]
-        parts = [band if isinstance(band, RenderedView) else (band,) for band in bands]
-        return (
-            list(parts[0]) if len(parts) == 1 else [*map(np.concatenate, zip(*parts, strict=True))]
-        )
-
-    def _render_depth(self, scene: BakedScene, camera: CameraState) -> NDArray[np.float32]:
-        return self._render_instant(scene.render_depth, self._shutter(camera, 0.5))[0]
-
-    def _bands(self, camera: CameraState) -> Iterator[tuple[tuple[Any, ...], dict[str, Any]]]:
-        """Yields K (3, 3) [px], width, height, X_WC, near and far of each band, its rows and
-        bodies."""
+    def _render_instant(self, render: Callable[..., Any], camera: CameraState, **shown: Any) -> Any:
+        """Renders the bands of an image, or of all images of a view, and joins them."""
         info, X_WC1 = camera.camera_info, camera.X_WB @ camera.X_BC
         K, width, height = info.intrinsic_matrix(), info.width(), info.height()
+
+        def render_rows(X_WC: RigidTransform, time: float, rows: tuple[int, int] | None) -> Any:
+            bodies = camera.bodies
+            moving = NO_GAUSSIANS if bodies is None else bodies.gaussians(max(0.0, time))
+            options = self._options | shown | {"moving": moving, "rows": rows}
+            return render(K, width, height, X_WC, *self._clipping, **options)
+
         if camera.X_WB_start is None:
-            placed = _placed(camera.bodies, camera.time)
-            yield (K, width, height, X_WC1, *self._clipping), {"moving": placed}
-            return
+            return render_rows(X_WC1, camera.time, None)
         X_WC0 = camera.X_WB_start @ camera.X_BC
         min_count = 1 if camera.bodies is None else _MIN_BANDS
-        focal = float(max(K[0, 0], K[1, 1]))
-        for first, last in row_bands(X_WC0, X_WC1, focal, height, min_count):
-            s = 0.5 * (first + last) / height  # of the time from the first row to the last
-            X_WC = pose_between(X_WC0, X_WC1, s)
-            placed = _placed(camera.bodies, camera.time - (1.0 - s) * self._readout)
-            yield (
-                (K, width, height, X_WC, *self._clipping),
-                {"moving": placed, "rows": (first, last)},
-            )
+        bands = []
+        for rows in row_bands(X_WC0, X_WC1, float(max(K[0, 0], K[1, 1])), height, min_count):
+            s = 0.5 * sum(rows) / height  # of the time from the first row to the last
+            time = camera.time - (1.0 - s) * self._readout
+            bands.append(render_rows(pose_between(X_WC0, X_WC1, s), time, rows))
+        if not isinstance(bands[0], RenderedView):
+            return np.concatenate(bands)
+        return RenderedView(*map(np.concatenate, zip(*bands, strict=True)))
+
+    def _render_depth(self, scene: BakedScene, camera: CameraState) -> NDArray[np.float32]:
+        return self._render_instant(scene.render_depth, self._shutter(camera, 0.5))
 
     def _age(self, time: float) -> float:
         return self._latency(time) if callable(self._latency) else self._latency
@@ -435,7 +401,7 @@ class SplatCamera(LeafSystem):
         has_start = self._readout + self._exposure > 0.0
         names = ["body_pose", "start_pose"] if has_start else ["body_pose"]
         X_WB, *start = (cast(RigidTransform, self.GetInputPort(n).Eval(context)) for n in names)
-        bodies = optional_value(self, "moving", context)
+        bodies = optional_input(self, "moving", context)
         time = bodies.time - self._age(bodies.time) if bodies else 0.0
         camera = self.camera_info(context), self.X_BC(context)
         return CameraState(*camera, X_WB, time, start[0] if start else None, bodies)
@@ -479,7 +445,3 @@ class SplatCamera(LeafSystem):
         time = context.get_time()
         # The oldest pose that is known is that of the start.
         output.SetAtIndex(0, min(time, max(0.0, time - self._age(time))))
-
-
-def _placed(bodies: Bodies | None, time: float) -> PlacedGaussians:
-    return NO_GAUSSIANS if bodies is None else bodies.gaussians(max(0.0, time))
