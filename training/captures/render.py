@@ -136,7 +136,7 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
         described = f"{type(shown).__name__} {seed}\n{dump_config(shown)}"
         digests, found = part_digests([described.encode()]), _generated_split(scenario.world, seed)
     else:
-        check_mesh(world, config.up)
+        check_mesh(world)
         recipe = RenderedWorld(str(world), world.name, config, version=_VERSION)
         digests, found = mesh_digests(world), "train"
     recipe.split = choose_split(recipe.origin, digests, config.split, found)

@@ -27,7 +27,6 @@ from splatpilot.systems.common.processes import one_torch_thread
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture, shrink_factor
 from splatpilot.training.captures.render import RECIPE, rendered_world
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
@@ -251,7 +250,7 @@ def with_default_route(
         shown = replace(world, gaussians=gaussians, num_frontier=len(frontier))
     try:
         if shown.observations is None:
-            ends = choose_start_and_goal(shown.esdf, VEHICLE_RADIUS)
+            ends = choose_start_and_goal(shown.esdf)
             route = ObservedRoute(*ends, float("nan"))
         else:
             shown = with_views(shown)

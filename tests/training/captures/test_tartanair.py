@@ -3,7 +3,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from room import room_color, write_room_capture
+from room import LOWER_W, UPPER_W, room_color, write_room_capture
 
 from splatpilot.training.captures.capture_registry import read_capture
 
@@ -17,14 +17,11 @@ def test_world_is_north_west_up(room):
     capture = read_capture(room)
     assert (len(capture), capture.width, capture.height, capture.name) == (12, 64, 48, "room")
     np.testing.assert_array_equal(capture.K, [[32, 0, 32], [0, 32, 24], [0, 0, 1]])
-    lower, upper = np.array([0.0, -1.5, 0.0]), np.array([6.0, 1.5, 2.5])
     v, u = np.mgrid[0:48, 0:64] + 0.5
     for frame in capture.frames():
         p_CQ = frame.back_project(u, v, frame.depth.astype(float))
         p_W = frame.X_WC.multiply(p_CQ.reshape(-1, 3).T).T.reshape(48, 64, 3)
-        to_wall = np.minimum(np.abs(p_W - lower), np.abs(p_W - upper)).min(axis=-1)
-        assert to_wall.max() < 1e-5
-        assert (p_W > lower - 1e-5).all() and (p_W < upper + 1e-5).all()
+        assert np.abs(np.minimum(p_W - LOWER_W, UPPER_W - p_W).min(axis=-1)).max() < 1e-5
         color = room_color(p_W * [1, -1, -1])
         np.testing.assert_allclose(frame.image / 255, color, atol=0.5 / 255 + 1e-4)
     optical = [[0, 0, 1, 0.8], [-1, 0, 0, 0], [0, -1, 0, 1.1]]
@@ -109,15 +106,14 @@ def test_frame_of_an_invalid_pose_is_left_out(room, line, message):
 
 def test_v2(tmp_path, room):
     v2 = tmp_path / "P000"
-    for name in ("image_lcam_front", "depth_lcam_front"):
-        (v2 / name).mkdir(parents=True)
-    (v2 / "pose_lcam_front.txt").write_text((room / "pose_left.txt").read_text())
-    for i in range(12):
-        image = room / "image_left" / f"{i:06d}_left.png"
-        (v2 / "image_lcam_front" / f"{i:06d}_lcam_front.png").write_bytes(image.read_bytes())
-        depth = np.load(room / "depth_left" / f"{i:06d}_left_depth.npy")
-        packed = depth.astype("<f4")[..., None].view(np.uint8)
-        cv2.imwrite(str(v2 / "depth_lcam_front" / f"{i:06d}_lcam_front_depth.png"), packed)
+    for file in room.rglob("*.*"):
+        copy = v2 / str(file.relative_to(room)).replace("left", "lcam_front")
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        if file.suffix == ".npy":
+            packed = np.load(file).astype("<f4")[..., None].view(np.uint8)
+            cv2.imwrite(str(copy.with_suffix(".png")), packed)
+        else:
+            copy.write_bytes(file.read_bytes())
     one, two = read_capture(room), read_capture(v2)
     assert len(two) == 12 and two.source.startswith("TartanAir V2")
     for i in (0, 7):

@@ -53,7 +53,7 @@ def test_held_out_frames_are_reconstructed(tmp_path, room, representation, count
     # Surfels have no blur of pixels, so more are required.
     changes = {"representation": representation, "initial_gaussians": count}
     start = fit(room, tmp_path / "start", **changes, iterations=1).means()
-    found = fit(room, tmp_path / "scene", **changes, iterations=250)
+    found = fit(room, tmp_path / "scene", **changes, iterations=150)
     assert found.means()["psnr_db"] > max(30, start["psnr_db"] + 2)
     assert found.means()["depth_mae_m"] < 0.1
     if representation == "3dgs":
@@ -89,7 +89,7 @@ def test_gaussians_are_added_only_without_depth(tmp_path, room):
 
 
 def test_depth_term_moves_gaussians_to_surfaces(tmp_path, room):
-    changes = {"initialization": "random", "surface_weight": 0.0, "iterations": 200}
+    changes = {"initialization": "random", "surface_weight": 0.0, "iterations": 100}
     without, found = (
         fit(room, tmp_path / "scene", **changes, depth_weight=weight).means()["depth_mae_m"]
         for weight in (0.0, 0.2)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from room import write_room_capture
+from room import LOWER_W, UPPER_W, write_room_capture
 
 from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
@@ -36,19 +36,19 @@ def test_room_end_to_end(tmp_path):
     of_scene = read_ply(tmp_path / "scene" / "gaussians.ply")
     assert len(of_scene) == summary.gaussians < len(world.gaussians)
     assert "TartanAir V1" in metadata.provenance and len(metadata.gains) == 12
+    assert metadata.split == "train"
 
     # It collides like the room: 6 x 3 x 2.5 m, not all of it seen.
-    lower, upper = np.array([0.0, -1.5, 0.0]), np.array([6.0, 1.5, 2.5])
     assert 30 < metadata.observed_free_volume <= 6 * 3 * 2.5 * 1.05
     p_WQ = np.array([[2.0, 0.0, 1.2], [4.0, 0.3, 1.4]])
-    truth = np.minimum(p_WQ - lower, upper - p_WQ).min(axis=-1)
+    truth = np.minimum(p_WQ - LOWER_W, UPPER_W - p_WQ).min(axis=-1)
     np.testing.assert_allclose(world.esdf.distance(p_WQ), truth, atol=0.06)
     assert (world.esdf.query(p_WQ).state == FieldState.FREE).all()
 
     # Start and goal are far apart in it and free.
     assert summary.route.length > 3
     ends = np.array([world.p_WS, world.p_WG])
-    assert (np.minimum(ends - lower, upper - ends) > VEHICLE_RADIUS).all()
+    assert (np.minimum(ends - LOWER_W, UPPER_W - ends) > VEHICLE_RADIUS).all()
     assert (world.esdf.conservative().distance(ends) > VEHICLE_RADIUS).all()
 
     photometry = Photometry(np.array(metadata.gains), metadata.vignetting)
@@ -119,12 +119,11 @@ def test_invalid_config(tmp_path, capture, change, message):
     assert not (tmp_path / "scene").exists()
 
 
-@pytest.mark.parametrize("split", ["", "validation"])
-def test_scene_has_the_split_and_digest_of_its_capture(tmp_path, room, capture, monkeypatch, split):
-    scene = tmp_path / "scene"
-    reconstruct(capture, scene, replace(CONFIG, split=split))
-    metadata = read_scene_metadata(scene)
-    assert metadata.split == (split or "train") and len(metadata.source_digest) == 8
+def test_scene_has_the_split_and_digest_of_its_capture(tmp_path, room, capture, monkeypatch):
+    given = replace(CONFIG, split="validation")
+    reconstruct(capture, tmp_path / "scene", given)
+    metadata = read_scene_metadata(tmp_path / "scene")
+    assert metadata.split == "validation" and len(metadata.source_digest) == 8
     copy = shutil.copytree(room, tmp_path / "renamed")
     for image in (copy / "image_left").iterdir():  # the same pixels in another file format
         cv2.imwrite(str(image), cv2.imread(str(image)), [cv2.IMWRITE_PNG_COMPRESSION, 0])
@@ -133,9 +132,7 @@ def test_scene_has_the_split_and_digest_of_its_capture(tmp_path, room, capture, 
     assert set(metadata.source_digest) <= digests
 
     monkeypatch.setattr(splits, "load_test_sources", lambda: {"hospital": source_digest(digests)})
-    if split:
-        with pytest.raises(ValueError, match=f"must be test, got {split}; it shows hospital"):
-            reconstruct(renamed, tmp_path / "other", replace(CONFIG, split=split))
-    else:
-        reconstruct(renamed, tmp_path / "other", CONFIG)
-        assert read_scene_metadata(tmp_path / "other").split == "test"
+    with pytest.raises(ValueError, match="must be test, got validation; it shows hospital"):
+        reconstruct(renamed, tmp_path / "other", given)
+    reconstruct(renamed, tmp_path / "other", CONFIG)
+    assert read_scene_metadata(tmp_path / "other").split == "test"
