@@ -161,15 +161,38 @@ def AddPolicyAndController(
     if delay and delay[1] > 0.0:
         decision = _add_delay(builder, scenario, policy, decision, delay)
         heading = heading and _add_delay(builder, scenario, policy, heading, delay)
-    target = _add_target(builder, scenario, state, decision)
-    if target.get_name() == "command":
+    target = decision
+    if decision.get_name() == "hypotheses":
+        count = num_hypotheses_in(decision.size())
+        selector = HypothesisSelector(count, scenario.controller.lookahead)
+        builder.AddNamedSystem("selector", selector)
+        ConnectInputs(builder, selector, {"hypotheses": decision, "state": state})
+        target = selector.GetOutputPort("waypoint")
+    name = target.get_name()
+    if name == "command":
         other = controller or guarded
-        require(not other, "the policy's decision", "other than command", "command", _NO_COMMAND)
+        require(not other, "the policy's decision", "other than command", name, _NO_COMMAND)
         return Autonomy(policy, None, target, target)
+
+    def finite(name: str, port: OutputPort, substitute: float = 0.0) -> OutputPort:
+        if not guarded:
+            return port
+        system = builder.AddNamedSystem(name, FiniteVector(port.size(), substitute))
+        builder.Connect(port, system.GetInputPort("signal"))
+        return system.GetOutputPort("finite")
+
     controller = controller or FlatnessController(scenario.controller, scenario.vehicle)
     add_system(builder, "controller", controller)
-    require_ports("controller", controller, inputs=["state"], outputs=["command"])
-    _connect_controller(builder, state, target, heading, controller, guarded)
+    source = finite("finite_target", target)
+    if name == "velocity":
+        tracker = builder.AddNamedSystem("velocity_tracker", VelocityTracker())
+        ConnectInputs(builder, tracker, {"state": state, "velocity": source})
+        name, source = "acceleration", tracker.GetOutputPort("acceleration")
+    require_ports("controller", controller, inputs=["state", name], outputs=["command"])
+    sources = {"state": state, name: source}
+    if heading is not None:
+        sources["heading"] = finite("finite_heading", heading, math.nan)
+    ConnectInputs(builder, controller, sources)
     return Autonomy(policy, controller, target, controller.GetOutputPort("command"))
 
 
@@ -203,61 +226,17 @@ def _add_delay(
     delay: Sequence[float],
 ) -> OutputPort:
     update = policy.GetUniquePeriodicDiscreteUpdateAttribute()
-    is_periodic = update is not None
     at_zero = update is None or update.offset_sec() == 0.0
     require(at_zero, "decision_delay", "empty for a policy that first updates after time 0", delay)
     condition = "empty for a policy without a periodic discrete update"
-    valid = is_periodic or getattr(policy, "rate", None) is not None
+    valid = update or getattr(policy, "rate", None) is not None
     require(valid, "decision_delay", condition, delay, "declare one in the policy")
     name, period = output.get_name(), decision_period(scenario, policy)
     step, seed = scenario.controller.period, scenario.seed
-    system = DecisionDelay(name, output.size(), period, delay, step, seed, not is_periodic)
+    system = DecisionDelay(name, output.size(), period, delay, step, seed, update is None)
     builder.AddNamedSystem(f"delayed_{name}", system)
     builder.Connect(output, system.get_input_port())
     return system.get_output_port()
-
-
-def _add_target(
-    builder: DiagramBuilder, scenario: Scenario, state: OutputPort, decision: OutputPort
-) -> OutputPort:
-    """Returns the decision; of hypotheses, the waypoint of the best."""
-    if decision.get_name() != "hypotheses":
-        return decision
-    count = num_hypotheses_in(decision.size())
-    selector = HypothesisSelector(count, scenario.controller.lookahead)
-    builder.AddNamedSystem("selector", selector)
-    builder.Connect(decision, selector.GetInputPort("hypotheses"))
-    connect(builder, state, selector.GetInputPort("state"))
-    return selector.GetOutputPort("waypoint")
-
-
-def _connect_controller(
-    builder: DiagramBuilder,
-    state: OutputPort,
-    target: OutputPort,
-    heading: OutputPort | None,
-    controller: System,
-    guarded: bool,
-) -> None:
-    def finite(name: str, port: OutputPort, substitute: float = 0.0) -> OutputPort:
-        if not guarded:
-            return port
-        system = builder.AddNamedSystem(name, FiniteVector(port.size(), substitute))
-        builder.Connect(port, system.GetInputPort("signal"))
-        return system.GetOutputPort("finite")
-
-    name, source = target.get_name(), finite("finite_target", target)
-    if name == "velocity":
-        tracker = builder.AddNamedSystem("velocity_tracker", VelocityTracker())
-        connect(builder, state, tracker.GetInputPort("state"))
-        connect(builder, source, tracker.GetInputPort("velocity"))
-        name, source = "acceleration", tracker.GetOutputPort("acceleration")
-    require_ports("controller", controller, inputs=["state", name], outputs=["command"])
-    connect(builder, state, controller.GetInputPort("state"))
-    connect(builder, source, controller.GetInputPort(name))
-    if heading is not None:
-        source = finite("finite_heading", heading, math.nan)
-        connect(builder, source, controller.GetInputPort("heading"))
 
 
 def ConnectObservation(
@@ -297,7 +276,7 @@ def ConnectOrExport(
 def ConnectInputs(builder: DiagramBuilder, system: System, sources: dict[str, OutputPort]) -> None:
     """Connects input ports of a system by their names."""
     for name, source in sources.items():
-        builder.Connect(source, system.GetInputPort(name))
+        connect(builder, source, system.GetInputPort(name))
 
 
 def require_ports(what: str, system: System, inputs: list[str], outputs: list[str]) -> None:
@@ -362,32 +341,31 @@ def AddObservation(
     exposure = imaging.exposure_time if "color_image" in names else 0.0
     frames = FrameTimes.draw(noise, scenario.seed)
     age = frames.age if noise.is_late else 0.0
-    camera = builder.AddNamedSystem(
-        "policy_camera", make_onboard_camera(config, world, age, exposure)
-    )
-    _connect_start_pose(builder, "policy_camera", camera, config, state, frames, exposure)
     if noise.is_late:
         pose = AddDelayedPose(builder, "delayed_pose", state, frames)
-    builder.Connect(pose, camera.GetInputPort("body_pose"))
+
+    def add_camera(name: str, config: OnboardCamera, exposure: float = 0.0) -> System:
+        camera = builder.AddNamedSystem(name, make_onboard_camera(config, world, age, exposure))
+        _connect_start_pose(builder, name, camera, config, state, frames, exposure)
+        builder.Connect(pose, camera.GetInputPort("body_pose"))
+        return camera
+
+    camera = add_camera("policy_camera", config, exposure)
     rendered = {"depth_image_32f" if name == "depth_grid" else name for name in names}
     images = {name: camera.GetOutputPort(name) for name in sorted(rendered)}
-    depth_sensor = None
+    depth_sensor, is_grid = None, "depth_grid" in names
     if "depth_image_32f" in images:
-        depth_sensor = imaging.depth_sensor("depth_grid" in names, config)
-    if isinstance(depth_sensor, Stereo) and depth_sensor.matching and "depth_image_32f" in images:
+        depth_sensor = imaging.depth_sensor(is_grid, config)
+    if isinstance(depth_sensor, Stereo) and depth_sensor.matching:
         matcher = builder.AddNamedSystem("depth_sensor", StereoMatcher(depth_sensor, config))
         for name, each in StereoMatcher.cameras(depth_sensor, config).items():
-            eye = builder.AddNamedSystem(
-                f"policy_camera_{name}", make_onboard_camera(each, world, age)
-            )
-            _connect_start_pose(builder, f"policy_camera_{name}", eye, each, state, frames)
-            builder.Connect(pose, eye.GetInputPort("body_pose"))
+            eye = add_camera(f"policy_camera_{name}", each)
             builder.Connect(eye.GetOutputPort("color_image"), matcher.GetInputPort(name))
         images["depth_image_32f"] = matcher.get_output_port()
         depth_sensor = None
 
     # Sensor and noise.
-    period, is_grid = decision_period(scenario, policy), "depth_grid" in names
+    period = decision_period(scenario, policy)
     rest = config, 1 / period, scenario.seed, frames.number
     changes: list[tuple[str, System]] = []
     if depth_sensor is not None:

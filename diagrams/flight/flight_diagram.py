@@ -50,7 +50,7 @@ from splatpilot.diagrams.flight.sensors import ESTIMATORS
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.moving_spheres import add_moving_spheres
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.common.drake import connect
+from splatpilot.systems.common.drake import connect, vector_output
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.policies.teleop import Teleop
@@ -62,7 +62,6 @@ from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant
 from splatpilot.systems.vehicle.quadrotor_geometry import QuadrotorGeometry, quadrotor_gaussians
-from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.systems.visualization.flight_visualizer import DRAWINGS, FlightVisualizer
 from splatpilot.systems.visualization.meshcat_drawing import (
     CameraVisualizer,
@@ -198,9 +197,9 @@ def AddFlight(
         world = randomize_appearance(world, scenario.appearance, scenario.seed)
     if scenario.moving:
         world = add_moving_spheres(world, scenario.moving)
-    given = {"plant": plant, "controller": controller}
 
     # Vehicle.
+    is_given = plant is not None
     plant = plant or QuadrotorPlant(scenario.vehicle, sample_initial_state(scenario, world))
     assert plant is not None
     add_system(builder, "plant", plant)
@@ -233,8 +232,7 @@ def AddFlight(
     if is_external:
         builder.ExportInput(policy.get_input_port(), f"{prefix}{autonomy.target.get_name()}")
     added, measured = AddSensors(builder, sensors, world, scenario, state)
-    observers = [policy, *added.values(), *([estimator] if estimator is not None else [])]
-    names = policy_images(*observers)
+    names = policy_images(policy, *added.values(), *([estimator] if estimator else []))
     if is_external:
         names = list({"color_image": 0, "depth_image_32f": 0} | dict.fromkeys(names))
     images = AddObservation(builder, scenario, world, state, pose, policy, names)
@@ -247,10 +245,10 @@ def AddFlight(
         ConnectObservation(builder, f"sensor {sensor_name!r}", sensor, observation | truth)
     if estimator is not None:
         ConnectObservation(builder, "estimator", estimator, observation | truth)
-    for what, system in given.items():
-        if system is not None:
-            known = observation if what == "controller" else {}
-            ConnectOrExport(builder, system, known, f"{prefix}{what}")
+    if is_given:
+        ConnectOrExport(builder, plant, {}, f"{prefix}plant")
+    if controller is not None:
+        ConnectOrExport(builder, controller, observation, f"{prefix}controller")
     onboard = None
     if camera:
         onboard = MakeCamera(scenario, world)
@@ -291,8 +289,8 @@ def AddFlight(
         )
         systems.append(geometry)
     counts = Counter(system.get_name() for system in builder.GetSystems())
-    for system, count in counts.items():
-        require(count == 1, "names of systems", "different", f"{count} of {system!r}", _RENAME)
+    [(common, count)] = counts.most_common(1)
+    require(count == 1, "names of systems", "different", f"{count} of {common!r}", _RENAME)
     parts = FlightParts(
         name=name,
         scenario=scenario,
@@ -354,11 +352,11 @@ def _moving_bodies(builder: DiagramBuilder, parts: FlightParts) -> MovingBodies:
 
 def _require_apart(parts: FlightParts, other: FlightParts) -> None:
     """Raises InfeasibleFlightError if two vehicles start in contact."""
-    starts = []
-    for plant in (parts.plant, other.plant):
-        state = plant.GetOutputPort("state").Eval(plant.CreateDefaultContext())
-        starts.append(QuadrotorState.of(np.asarray(state)).p_WB)
-    distance = float(np.linalg.norm(starts[0] - starts[1]))
+    one, two = (
+        vector_output(plant, "state", plant.CreateDefaultContext())[:3]
+        for plant in (parts.plant, other.plant)
+    )
+    distance = float(np.linalg.norm(one - two))
     apart = parts.scenario.vehicle.radius + other.scenario.vehicle.radius
     if distance <= apart:
         raise InfeasibleFlightError(
@@ -522,12 +520,10 @@ def AddMeshcat(
     plans = parts.decision if parts.decision.get_name() == "hypotheses" else None
     outputs = ("distance", "gradient", "barrier")
     sources = {name: parts.collision.GetOutputPort(name) for name in outputs}
-    sources["command"] = parts.command
+    sources |= {"command": parts.command, parts.decision.get_name(): parts.decision}
     if plans is not None:
         selector = builder.GetSubsystemByName("selector")
         sources["waypoint"] = selector.GetOutputPort("waypoint")
-    elif parts.decision.get_name() == "waypoint":
-        sources["waypoint"] = parts.decision
     vehicle = [name for name in draw if name not in ("depth", "frustum", "limits")]
     FlightVisualizer.AddToBuilder(
         builder,
@@ -584,15 +580,8 @@ def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
 
 def camera_info(config: CameraConfig) -> CameraInfo:
     """Returns the intrinsics of a camera."""
-    center_x, center_y = config.principal_point()
-    return CameraInfo(
-        width=config.width,
-        height=config.height,
-        focal_x=config.focal_x(),
-        focal_y=config.focal_y(),
-        center_x=center_x,
-        center_y=center_y,
-    )
+    focal, center = (config.focal_x(), config.focal_y()), config.principal_point()
+    return CameraInfo(config.width, config.height, *focal, *center)
 
 
 def camera_mount(config: CameraConfig) -> RigidTransform:

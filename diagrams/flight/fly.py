@@ -99,17 +99,17 @@ def flight_page(
     if scenario.moving:
         world = add_moving_spheres(world, scenario.moving)
     spheres = world.moving.spheres if world.moving else None
-    view, scene = _view(scenario, world), (world.gaussians, world.background)
-    return HtmlPage(replay_page(meshcat.StaticHtml(), *scene, view, shown, spheres))
+    scene = world.gaussians, world.background, _view(scenario, world)
+    return HtmlPage(replay_page(meshcat.StaticHtml(), *scene, shown, spheres))
 
 
 def running_page(meshcat: Meshcat, scenario: Scenario, world: World) -> HtmlPage:
     """Makes a page that shows a running flight, which `meshcat` draws, see `live_page`."""
     world = randomize_appearance(world, scenario.appearance, scenario.seed)
     highest = max(start_position(scenario, world)[2], goal_position(scenario, world)[2])
-    view, scene = _view(scenario, world), (world.gaussians, world.background)
+    view = _view(scenario, world)
     cut = min(highest + 2 * scenario.vehicle.radius, view.upper)
-    return HtmlPage(live_page(meshcat, *scene, view, cut))
+    return HtmlPage(live_page(meshcat, world.gaussians, world.background, view, cut))
 
 
 def _view(scenario: Scenario, world: World) -> ReplayView:
@@ -161,12 +161,10 @@ def run(
     """
     scenario = sample_scenario(scenario)
     scenario.validate()
-    for path in (out, rerun, graphviz):
-        if path is not None:
-            require_unused(path, overwrite)
-    for path in (rerun, graphviz):
-        if path is not None:
-            require_writable_folder(path.absolute().parent)
+    require_unused(out, overwrite)
+    for path in filter(None, (rerun, graphviz)):
+        require_unused(path, overwrite)
+        require_writable_folder(path.absolute().parent)
     by_hand = isinstance(scenario.policy, TeleopConfig)
     require(live or not by_hand, "--policy teleop", "flown with --live", "no --live")
     check_drawings(draw)

@@ -22,7 +22,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
-from splatpilot.diagrams.flight.blocks import AddMovingBodies
+from splatpilot.diagrams.flight.blocks import AddMovingBodies, ConnectInputs
 from splatpilot.diagrams.flight.scenario import Scenario, goal_position, sample_scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
@@ -129,7 +129,6 @@ class FlightMonitor(LeafSystem):
         return [vector.GetAtIndex(i) for i in range(size)]
 
     def _eval_end(self, context: Context) -> tuple[float, Outcome | None]:
-        """Returns the minimum margin, and the outcome other than a timeout."""
         return cast(Any, self.get_cache_entry(self._end_index).Eval(context))
 
     def margin(self, context: Context) -> float:
@@ -170,7 +169,7 @@ class _MonitorByValues(ByValues):
         self.DeclarePeriodicPublishEvent(timeout, timeout, self._check)
 
     def _calc_outcome(self, context, output):
-        output.set_value(str(self._system.outcome(self.context_of_values(context)) or ""))
+        self._system._calc_outcome(self.context_of_values(context), output)
 
     def _check(self, context):
         return self._system._check(self.context_of_values(context))
@@ -210,16 +209,10 @@ def AddFlightMonitor(
         goal = builder.AddNamedSystem("goal", source).get_output_port()
     monitor = FlightMonitor(scenario, world)
     builder.AddNamedSystem("monitor", monitor)
-    clearance = collision.GetOutputPort("clearance")
-    for name, port in (
-        ("state", state),
-        ("goal", goal),
-        ("clearance", clearance),
-        ("field_state", collision.GetOutputPort("field_state")),
-    ):
-        connect(builder, port, monitor.GetInputPort(name))
+    measured = {name: collision.GetOutputPort(name) for name in ("clearance", "field_state")}
+    ConnectInputs(builder, monitor, {"state": state, "goal": goal} | measured)
     if logs:
-        AddLogs(builder, {"state": state, "command": command, "clearance": clearance})
+        AddLogs(builder, {"state": state, "command": command, "clearance": measured["clearance"]})
     if logs and hypotheses is not None:
         AddLogs(builder, {"hypotheses": hypotheses}, plan_period)
     return monitor

@@ -176,16 +176,14 @@ def _fly_once(
     realtime_rate: float,
 ) -> dict[str, Flight] | None:
     """Simulates all flights of a diagram, see `fly_all`; returns None to begin again."""
-    monitors = {
-        system.get_name(): (parent, system) for parent, system in _require_monitors(diagram)
-    }
-    names = [system.get_name() for _, system in _require_monitors(diagram)]
+    found = _require_monitors(diagram)
+    systems = [system for _, system in found]
+    names = [system.get_name() for system in systems]
+    monitors = dict(zip(names, found, strict=True))
     require(len(monitors) == len(names), "names of FlightMonitors", "different", names)
     simulator = make_flight_simulator(diagram)
     simulator.set_target_realtime_rate(realtime_rate)
     root = simulator.get_mutable_context()
-
-    systems = [system for _, system in monitors.values()]
     for system in systems:
         system.overrun = None
 
@@ -200,7 +198,7 @@ def _fly_once(
         return status
 
     simulator.set_monitor(watch)
-    limit = max(system.scenario.timeout for _, system in monitors.values())
+    limit = max(system.scenario.timeout for system in systems)
     flights: dict[str, Flight] = {}
 
     def record(outcome: Outcome | None = None) -> None:
@@ -220,13 +218,8 @@ def _fly_once(
     try:
         record()
         for name, flight in flights.items():
-            require(
-                flight.outcome is Outcome.GOAL,
-                name,
-                "in flight at its start",
-                flight.outcome,
-                _START,
-            )
+            at_goal, condition = flight.outcome is Outcome.GOAL, "in flight at its start"
+            require(at_goal, name, condition, flight.outcome, _START)
         while len(flights) < len(monitors):
             end = min(_next_time(system, root) for system in systems)
             status = simulator.AdvanceTo(min(end, limit))
@@ -357,8 +350,7 @@ def record_flight(
         return times, rows
 
     times, states = samples("state")
-    _, commands = samples("command")
-    _, clearances = samples("clearance")
+    commands, clearances = samples("command")[1], samples("clearance")[1]
     plans = np.empty((0, 0))
     if diagram.HasSubsystemNamed(f"{prefix}hypotheses_log"):
         # A log samples before the policy updates at the same instant: the last plan is missing.
