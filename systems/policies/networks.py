@@ -161,18 +161,7 @@ DepthLayer = tuple[int, int, int, int]
 """Channels, width of the kernel, stride and padding of a convolution."""
 
 
-def depth_layers(layers: Sequence[DepthLayer], channels: int = 1) -> list[Convolution]:
-    """Returns convolutions of an image of `channels`, each followed by a leaky ReLU."""
-    convolutions, inputs = [], channels
-    for i, (outputs, kernel, stride, padding) in enumerate(layers):
-        weight, bias = f"convolutions.{i}.weight", f"convolutions.{i}.bias"
-        sizes = inputs, outputs, kernel, stride
-        layer = Convolution(weight, bias, *sizes, activation="leaky_relu", pad=padding)
-        convolutions.append(layer)
-        inputs = outputs
-    return convolutions
-
-
+@dataclass(frozen=True)
 class DepthSpec:
     """Base class of architectures with convolutions of a depth image."""
 
@@ -190,8 +179,14 @@ class DepthSpec:
         return prod(output_size(self.image_size(), self.image_layers()))
 
     def image_layers(self) -> list[Convolution]:
-        """Lists the convolutions, first to last."""
-        return depth_layers(self.convolutions, self.image_channels)
+        """Lists the convolutions, first to last, each followed by a leaky ReLU."""
+        layers, inputs = [], self.image_channels
+        for i, (outputs, kernel, stride, pad) in enumerate(self.convolutions):
+            weight, bias = f"convolutions.{i}.weight", f"convolutions.{i}.bias"
+            sizes = inputs, outputs, kernel, stride
+            layers.append(Convolution(weight, bias, *sizes, activation="leaky_relu", pad=pad))
+            inputs = outputs
+        return layers
 
 
 class DepthEncoder:
@@ -218,9 +213,6 @@ def leaky_relu(x: np.ndarray) -> np.ndarray:
 class NetworkSpec(DepthSpec):
     """Architecture of the network."""
 
-    image_height: int
-    image_width: int
-    convolutions: tuple[DepthLayer, ...]
     state_size: int
     state_features: int
     hidden_size: int

@@ -256,12 +256,12 @@ class Imaging(Config):
             return nominal
         _require_pinhole("imaging.focal_scale", nominal)
 
-        def scaled(fov: float | None) -> float | None:
-            slope = None if fov is None else math.tan(math.radians(0.5 * fov))
-            return slope and math.degrees(2.0 * math.atan(slope / self.focal_scale))
+        def scaled(fov: float) -> float:
+            slope = math.tan(math.radians(0.5 * fov))
+            return math.degrees(2.0 * math.atan(slope / self.focal_scale))
 
-        fov_x, fov_y = scaled(nominal.fov_x), scaled(nominal.fov_y)
-        return replace(nominal, fov_x=cast(float, fov_x), fov_y=fov_y)
+        fov_y = None if nominal.fov_y is None else scaled(nominal.fov_y)
+        return replace(nominal, fov_x=scaled(nominal.fov_x), fov_y=fov_y)
 
     def depth_sensor(
         self, is_grid: bool, camera: OnboardCamera

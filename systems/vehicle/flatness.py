@@ -297,10 +297,9 @@ def FlatnessController_(T):
             ]
             numbers = native_control(config, params)
             self._numbers = np.array([numbers.get(n, 0.0) for n in _native.FLIGHT_PARAMETERS])
-            self.DeclareVectorInputPort("state", 13)
-            self.DeclareVectorInputPort("waypoint", 3)
-            self.DeclareVectorInputPort("acceleration", 3)
-            self.DeclareVectorInputPort("heading", 1)
+            sizes = {"state": 13, "waypoint": 3, "acceleration": 3, "heading": 1}
+            for name, size in sizes.items():
+                self.DeclareVectorInputPort(name, size)
             hover = BasicVector_[T]([params.gravity, 0.0, 0.0, 0.0])
             self.DeclareStateOutputPort("command", self.DeclareDiscreteState(hover))
             if config.disturbance_time > 0.0:
@@ -356,8 +355,7 @@ def FlatnessController_(T):
                 command = np.empty(4)
                 target = target if disturbance is None else target - disturbance
                 _native.flight_command(kind, state, target, self._numbers, command)
-                discrete_state.set_value(0, command)
-                return
+                return discrete_state.set_value(0, command)
             a_WB, motion_W = target, v_WB
             if use_waypoint:
                 a_WB = reaching_acceleration(target, p_WB, v_WB, config.lookahead)
@@ -371,9 +369,7 @@ def FlatnessController_(T):
 
         def _eval_finite(self, name, context):
             value = vector_input(self, name, context)
-            numbers = float_values(value)
-            if not np.isfinite(numbers).all():
-                require_finite(self.GetInputPort(name), context, numbers)
+            require_finite(self.GetInputPort(name), context, float_values(value))
             return value
 
     return FlatnessController
