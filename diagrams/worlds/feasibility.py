@@ -113,7 +113,6 @@ class _Part(NamedTuple):
 
 def choose_start_and_goal(
     esdf: Esdf,
-    radius: float,
     margin: float = 0.2,
     longest: float = 40.0,
     min_length: float = SHORTEST,
@@ -122,12 +121,12 @@ def choose_start_and_goal(
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
     They are the ends of (nearly) the longest of all shortest paths, `min_length` to `longest` or
-    1.5 `min_length` [m], of a sphere of `radius` through known free space, with `margin` [m] to
-    spare or half of that. Given a seed, they are drawn: the start from the same part of free
+    1.5 `min_length` [m], of the vehicle through known free space, with `margin` [m] to spare or
+    half of that. Given a seed, they are drawn: the start from the same part of free
     space, the goal from the nodes whose shortest path is at least 60 % of that.
     """
     longest = max(longest, 1.5 * min_length)
-    part = longest_part(esdf, radius, margin, longest, min_length)
+    part = longest_part(esdf, margin, longest, min_length)
     if seed is None:
         goal, length = _farthest(part.graph, part.end, longest)
         return part.p_WN[part.end], part.p_WN[goal], length
@@ -140,7 +139,7 @@ def choose_start_and_goal(
         if len(far):
             goal = int(rng.choice(far))
             return part.p_WN[start], part.p_WN[goal], float(lengths[goal])
-    raise _infeasible(esdf, radius, margin, part.length, min_length)
+    raise _infeasible(esdf, margin, part.length, min_length)
 
 
 def short_route_warning(length: float) -> str:
@@ -157,25 +156,19 @@ def choose_ends(
     esdf: Esdf, source: object, min_length: float = SHORTEST, seed: int | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Chooses p_WS and p_WG, or draws them; warns if the longest route of the `source` is short."""
-    p_WS, p_WG, length = choose_start_and_goal(
-        esdf, VEHICLE_RADIUS, min_length=min_length, seed=seed
-    )
+    p_WS, p_WG, length = choose_start_and_goal(esdf, min_length=min_length, seed=seed)
     if seed is None and (warning := short_route_warning(length)):
         _log.warning("%s: %s", source, warning)
     return p_WS, p_WG
 
 
 def longest_part(
-    esdf: Esdf,
-    radius: float,
-    margin: float = 0.2,
-    longest: float = 40.0,
-    min_length: float = SHORTEST,
+    esdf: Esdf, margin: float = 0.2, longest: float = 40.0, min_length: float = SHORTEST
 ) -> _Part:
     """Returns the connected part of the free space with the longest path, up to `longest` [m]. Half
     of the margin is preferred for a path `_GAIN` times as long if one is not `LONG_ENOUGH`."""
     best, reach = None, 0.0
-    for graph, p_WN, spacing in _free_graphs(esdf, radius, margin):
+    for graph, p_WN, spacing in _free_graphs(esdf, margin):
         if best is not None and best.length >= max(LONG_ENOUGH, min_length):
             break
         _, label = connected_components(graph, directed=False)
@@ -191,14 +184,14 @@ def longest_part(
                 best, reach = _Part(graph, p_WN, nodes, end, length), length
         reach *= _GAIN
     if best is None or best.length < min_length:
-        raise _infeasible(esdf, radius, margin, 0.0 if best is None else best.length, min_length)
+        raise _infeasible(esdf, margin, 0.0 if best is None else best.length, min_length)
     return best
 
 
 def _free_graphs(
-    esdf: Esdf, radius: float, margin: float
+    esdf: Esdf, margin: float
 ) -> Iterator[tuple[csr_array, NDArray[np.float64], float]]:
-    """Yields graphs of the space free for a sphere, with all and half of `margin`: graph, nodes
+    """Yields graphs of the space free for the vehicle, with all and half of `margin`: graph, nodes
     (N, 3) [m] and their spacing [m]. The free spheres about the ends of an edge cover it."""
     # As in `Esdf.conservative`, but for free space alone, which takes a fifth of the time.
     unknown = esdf.states == FieldState.UNKNOWN
@@ -212,7 +205,7 @@ def _free_graphs(
         for low, size in zip(esdf.lower_W, extent, strict=True)
     ]
     p_WN = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)  # (nx, ny, nz, 3)
-    clearance = conservative_distance(field, p_WN) - radius  # [m]
+    clearance = conservative_distance(field, p_WN) - VEHICLE_RADIUS  # [m]
     for need in (margin, margin / 2):
         if np.count_nonzero(clearance > need) >= 2:
             graph, nodes = grid_graph(clearance > need, spacing)
@@ -224,12 +217,12 @@ def _free_graphs(
 
 
 def _infeasible(
-    esdf: Esdf, radius: float, margin: float, reach: float, min_length: float
+    esdf: Esdf, margin: float, reach: float, min_length: float
 ) -> InfeasibleFlightError:
     largest = float(esdf.conservative().distances.max())
     return InfeasibleFlightError(
-        f"the longest route of a vehicle of radius {radius} m with {margin / 2:g} m to spare must "
-        f"be at least {min_length:g} m, got {reach:.2f} m; the largest clearance is "
+        f"the longest route of a vehicle of radius {VEHICLE_RADIUS} m with {margin / 2:g} m to "
+        f"spare must be at least {min_length:g} m, got {reach:.2f} m; the largest clearance is "
         f"{largest:.2f} m, and unknown space counts as occupied: capture more of the scene"
     )
 

@@ -158,7 +158,7 @@ def mesh_world(config: MeshWorld, seed: int) -> World:
     from splatpilot.diagrams.worlds.mesh_renderer import MeshScene, shade
 
     path = find_data(Path(config.path), "a mesh")
-    check_mesh(path, config.up)
+    check_mesh(path)
     esdf = mesh_distance(path, config.up, config.voxel_size, config.scale)
     drawn = {"min_length": config.min_path, "seed": seed} if config.draw_ends else {}
     ends = choose_ends(_above_surfaces(esdf), config.path, **drawn)

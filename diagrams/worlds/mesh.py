@@ -61,12 +61,11 @@ UP = {"y": RotationMatrix.MakeXRotation(np.pi / 2).matrix().round(), "z": np.eye
 _log = logging.getLogger(__name__)
 
 
-def check_mesh(mesh: Path, up: str) -> None:
-    """Checks the file, the axis and the required extensions of a mesh."""
+def check_mesh(mesh: Path) -> None:
+    """Checks the file and the required extensions of a mesh."""
     require_file(mesh)
     suffix, known = mesh.suffix.lower(), f"one of {', '.join(SUFFIXES)}"
     require(suffix in SUFFIXES, f"{mesh}: the suffix", known, mesh.suffix)
-    require(up in UP, "up", "y (as glTF says) or z", up)
     if suffix != ".obj":
         with readable(mesh, "mesh"):
             required = _description(mesh.read_bytes()).get("extensionsRequired", [])

@@ -36,8 +36,6 @@ from splatpilot.systems.splats.baked_scene import NO_GAUSSIANS, BakedScene, Plac
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 from splatpilot.systems.splats.splat_camera import empty_scene
 
-MIN_DEPTH, MAX_DEPTH = 0.05, 150.0  # [m], range of the depth images; nearer is 0, farther is inf
-
 # Lamps at infinity: direction and intensity of one overhead, four from the sides so that no wall is
 # dark or like its neighbor, one from below for undersides. White that faces up is just not clipped.
 _LAMPS = (
@@ -71,7 +69,7 @@ class MeshRenderer:
     """
 
     def __init__(self, mesh: Path, up: str, background: Sequence[float], scale: float = 1.0):
-        check_mesh(mesh, up)
+        check_mesh(mesh)
         require_opengl()
         lights = [
             LightParameter(type="directional", frame="world", direction=d, intensity=intensity)
@@ -100,7 +98,7 @@ class MeshRenderer:
         K: NDArray[np.float64],
         width: int,
         height: int,
-        depth_range: tuple[float, float] = (MIN_DEPTH, MAX_DEPTH),
+        depth_range: tuple[float, float] = (0.05, 150.0),
         with_color: bool = True,
     ) -> MeshImages:
         """Returns the view of a camera at X_WC with intrinsics K (3, 3) [px], in a range of depth

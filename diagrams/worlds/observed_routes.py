@@ -17,7 +17,6 @@ from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.scene import color_to_sh
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 MAX_UNOBSERVED = 0.02  # mean fraction of the pixels along a route
 _CAMERA = OnboardCamera(width=32, height=24)  # 90 x 74 degrees, the widest view of the policies
@@ -83,7 +82,7 @@ def with_views(world: World) -> World:
     InfeasibleFlightError without such space."""
     if world.observations is None:
         return world
-    points, spacing = longest_part(world.esdf, VEHICLE_RADIUS).p_WN, _MIN_SPACING
+    points, spacing = longest_part(world.esdf).p_WN, _MIN_SPACING
     while True:
         cells = np.round(points / spacing).astype(int)
         first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
@@ -156,7 +155,7 @@ class _Search:
 
     def __init__(self, world: World, min_length: float) -> None:
         self._min_length = min_length
-        self.part = longest_part(world.esdf, VEHICLE_RADIUS, min_length=min_length)
+        self.part = longest_part(world.esdf, min_length=min_length)
         observations = world.observations
         assert observations is not None and len(observations.view_points)
         self._views = ObservedViews(world)

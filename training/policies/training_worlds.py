@@ -278,8 +278,6 @@ def _make_worlds(
             worlds.append(cache.world(library.scenario_world(turn), seed))
             continue
         esdf, conservative = scenes[turn]
-        p_WS, p_WG, _ = choose_start_and_goal(
-            esdf, VEHICLE_RADIUS, _SCENE_MARGIN, _MAX_SCENE_PATH, seed=seed
-        )
+        p_WS, p_WG, _ = choose_start_and_goal(esdf, _SCENE_MARGIN, _MAX_SCENE_PATH, seed=seed)
         worlds.append(TrainingWorld(conservative, esdf.lower_W, esdf.upper_W, p_WS, p_WG))
     return worlds

@@ -224,7 +224,7 @@ def test_meshes_that_cannot_be_worlds_are_refused(scene, key, values, message):
 
     file = scene({}, png(HALVES), change=change)
     with pytest.raises(ValueError, match=message):
-        check_mesh(file, "y")
+        check_mesh(file)
         mesh_distance(file, "y", 0.1)
 
 
