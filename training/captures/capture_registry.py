@@ -52,9 +52,9 @@ def register_capture(
     return added
 
 
-# The first format that recognizes a path reads it.
+# The first format that recognizes a path reads it; any folder of images passes for photographs.
 _BUILT_IN = {
-    name: CaptureFormat(recognizes, read, description)
+    name: register_capture(name, recognizes, read, description=description)
     for name, recognizes, read, description in (
         ("tartanair_v1", partial(tartanair.recognizes, version="V1"),
          partial(tartanair.read, version="V1"),
@@ -78,14 +78,11 @@ _BUILT_IN = {
         ("video", photographs.is_video, photographs.read_video, "a video (.mp4, .mov, ...)"),
     )
 }  # fmt: skip
-for _name, _format in _BUILT_IN.items():
-    CAPTURES.add(_name, _format)
 
 
 def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Capture:
     """Opens a capture of any format, which is recognized by its files, those of other packages
-    first: any folder of images passes for photographs. `capture.yaml` in the folder completes
-    `config`."""
+    first. `capture.yaml` in the folder completes `config`."""
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"No such file or folder: {path}")
@@ -105,8 +102,7 @@ def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Captu
 
 
 def _recognize(path: Path) -> CaptureFormat:
-    names = sorted(CAPTURES.names(), key=lambda name: name in _BUILT_IN)
-    for name in names:
+    for name in sorted(CAPTURES.names(), key=lambda name: name in _BUILT_IN):
         if (found := CAPTURES.find(name)).recognizes(path):
             return found
     known = ", ".join(CAPTURES.find(name).description or name for name in CAPTURES.names())

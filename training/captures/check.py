@@ -259,16 +259,13 @@ def _check_features(capture: Capture, pairs: int) -> CheckReport:
 
     def measure(reading: Reading) -> ReadingFit:
         X = RigidTransform(reading.R_BC)
-        errors, before = zip(*(
-            epipolar_errors(
-                reading.K,
-                reading.bend,
-                pair,
-                (reading.pose(poses[j]) @ X).inverse() @ reading.pose(poses[i]) @ X,
-            )
-            for pair in matched
-            for i, j in [pair.frames]
-        ), strict=True)  # fmt: skip
+        errors, before = [], []
+        for pair in matched:
+            a, b = (reading.pose(poses[k]) for k in pair.frames)
+            X_BA = (b @ X).inverse() @ a @ X
+            error, ahead = epipolar_errors(reading.K, reading.bend, pair, X_BA)
+            errors.append(error)
+            before.append(ahead)
         inside = float(np.concatenate(before).mean())
         median = float(np.median(np.concatenate(errors)))
         return ReadingFit(reading.name, median if inside >= _MIN_BEFORE else np.inf, inside)
@@ -370,16 +367,13 @@ def _pose_readings(as_read: Reading) -> list[Reading]:
         return replace(as_read, name=name, pose=pose)
 
     def w_last(R: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Undoes that w x y z was read as x y z w."""
         return Rotation.from_quat(Rotation.from_matrix(R).as_quat()[[1, 2, 3, 0]]).as_matrix()
 
-    present = next(
-        (name for name, R in _BODIES.items() if np.allclose(R, as_read.R_BC.matrix())), "its axes"
-    )
-    columns = "rotations are stored column by column, read row by row"
+    equal = (name for name, R in _BODIES.items() if np.allclose(R, as_read.R_BC.matrix()))
+    present, columns = next(equal, "its axes"), "rotations are stored column by column"
     readings = [
         posed("quaternions are w x y z, read as x y z w", w_last, lambda p: p),
-        posed(columns, lambda R: R.T, lambda p: p),
+        posed(f"{columns}, read row by row", lambda R: R.T, lambda p: p),
     ]
     for name, R in _BODIES.items():
         body = replace(as_read, R_BC=RotationMatrix(np.array(R, dtype=float)))
@@ -449,12 +443,9 @@ def _minimize(
 
 
 def fit_color_camera(capture: Capture, pairs: Sequence[tuple[int, int]]) -> ColorFit | None:
-    """Fits the focal length and position of the color camera, its axes parallel to depth's.
-
-    A point on a surface has about the same luminance in two frames; a wrong color camera samples
-    other points, which differ from frame to frame. Correlation does not depend on exposure.
-    Returns None if too few points are seen twice.
-    """
+    """Fits the focal length and position of the color camera, its axes parallel to depth's, by the
+    correlation between frames of the luminance of surface points, which does not depend on
+    exposure. Returns None if too few points are seen twice."""
     depth_camera = capture.depth_camera
     K_D = capture.K if depth_camera is None else depth_camera.K
     X_DC = RigidTransform() if depth_camera is None else depth_camera.X_CD.inverse()
@@ -524,8 +515,7 @@ def _correlation(
     K: NDArray[np.float64],
     X_DC: RigidTransform,
 ) -> float | None:
-    """Returns the correlation of luminance at points p_DQ in two images, None if too few points
-    are inside both."""
+    """Returns the correlation of luminance at points p_DQ that two images show, if enough."""
     samples = []
     for p_DQ, image in pair:
         x, y, z = X_DC.inverse().multiply(p_DQ)

@@ -8,7 +8,7 @@ import re
 import unicodedata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from os.path import isfile
 from pathlib import Path
 from typing import Any
@@ -318,8 +318,8 @@ def open_frames(
             f"{1 - _MAX_DROPPED:.0%} must be{first}"
         )
 
-    def shared_lens() -> Lens:
-        width, height = next(frame.size for frame in usable if frame.files.lens is None)
+    @cache
+    def shared_lens(width: int, height: int) -> Lens:
         if config.intrinsics:
             return Lens(pinhole(*config.intrinsics), width, height, source="capture.intrinsics")
         if lens is None:
@@ -327,9 +327,8 @@ def open_frames(
         return lens(width, height)
 
     with errors_about(path):
-        shared = shared_lens() if any(frame.files.lens is None for frame in usable) else None
-        lenses = [frame.files.lens or shared for frame in usable]
-        distinct = [each for each in dict.fromkeys(lenses) if each is not None]
+        lenses = [frame.files.lens or shared_lens(*frame.size) for frame in usable]
+        distinct = list(dict.fromkeys(lenses))
         camera = common_pinhole(distinct)
     # Some cameras focus every frame again: the maps of all would fill the memory.
     cached_maps = lru_cache(_MAPS)(lambda lens: resampling_maps(lens, camera))
@@ -366,8 +365,7 @@ def open_frames(
         return resample(depth, i, cv2.INTER_NEAREST)
 
     def resample(image: NDArray, i: int, interpolation: int) -> NDArray:
-        lens = lenses[i]
-        if lens is None or (maps := cached_maps(lens)) is None:
+        if (maps := cached_maps(lenses[i])) is None:
             return image
         # The pinhole sees up to half a pixel more than the lens, which is not black.
         return cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_REPLICATE)
