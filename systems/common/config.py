@@ -12,12 +12,11 @@ import inspect
 import re
 import reprlib
 import shutil
-import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from itertools import zip_longest
 from math import inf
 from pathlib import Path
-from textwrap import indent
+from textwrap import dedent, indent, wrap
 from types import NoneType, UnionType
 from typing import Any, Union, cast, get_args, get_origin
 
@@ -26,7 +25,9 @@ import yaml
 from pydrake.common.yaml import yaml_load_data, yaml_load_typed
 
 from splatpilot.systems.common.distributions import (
+    DrawnField,
     FieldPath,
+    config_fields,
     distribution_text,
     dump_config,
     find_distributions,
@@ -134,8 +135,8 @@ def parse_config[Configuration](
     """
     with yaml_errors(source):
         given = yaml_load_data(text, private=True)
-        _require_distinct_keys(text)
         try:
+            _require_distinct_keys(text)
             drawn, start = {}, tuple(filter(None, prefix.split(".")))
             if dataclasses.is_dataclass(defaults):  # Drake's types take the distributions they can
                 text, drawn = take_distributions(text, start)
@@ -240,14 +241,13 @@ def _put(config: Any, path: FieldPath, distribution: Any, prefix: str) -> None:
         plain = isinstance(config, dict | list)
         config = config[holder] if plain else getattr(config, str(holder))  # pyright: ignore
         prefix += f"{holder}."
-    if isinstance(config, dict | list):
-        config[name] = distribution  # pyright: ignore
-        return
-    if name not in field_types(config):
-        raise ValueError(f"there is no field {prefix}{name}; {_hint(config, name, None, prefix)}")
-    plain = not dataclasses.is_dataclass(config)
-    require(not plain, f"{prefix}{name}", "one value", distribution_text(distribution))
-    object.__setattr__(config, str(name), distribution)
+    if not isinstance(config, dict | list):
+        if name not in field_types(config):
+            hint = _hint(config, name, None, prefix)
+            raise ValueError(f"there is no field {prefix}{name}; {hint}")
+        is_ours, text = dataclasses.is_dataclass(config), distribution_text(distribution)
+        require(is_ours, f"{prefix}{name}", "one value", text)
+    DrawnField(path, config, distribution).put(distribution)
 
 
 def _check_names(config: Any, given: Any, prefix: str, kinds: Sequence[Any] = ()) -> None:
@@ -323,9 +323,7 @@ def _names(given: Any) -> list[str]:
 
 def field_types(config: Any) -> dict[str, Any]:
     """Returns the types of a configuration's fields by name; empty for plain values."""
-    if dataclasses.is_dataclass(config):
-        return {field.name: field.type for field in dataclasses.fields(config)}
-    return {field.name: field.type for field in getattr(config, "__fields__", ())}  # Drake's own
+    return {field.name: field.type for field in config_fields(config)}
 
 
 def _check_type(name: str, expected: Any, value: Any) -> None:
@@ -357,7 +355,7 @@ def _converts(value: Any, expected: type) -> bool:
 
 def _import_types(config: Any, text: str) -> None:
     """Imports packages that announce configurations, if the text has a tag that is not known."""
-    for field in dataclasses.fields(config) if dataclasses.is_dataclass(config) else ():
+    for field in config_fields(config):
         if isinstance(field, RegistryField):
             known = {known.__name__ for known in field.registry.configs()}
             if set(re.findall(r"!(\w+)", text)) - known:
@@ -402,21 +400,17 @@ def describe_fields(config: Any) -> list[FieldDescription]:
     The text of a field is a comment above it, a comment after it, or a string below it; without
     any, the first paragraph of the configuration that it holds. Drake's fields have docstrings.
     """
-    if not dataclasses.is_dataclass(config):
-        names = [field.name for field in getattr(config, "__fields__", ())]
-        return [FieldDescription(n, getattr(config, n), _drake_text(config, n)) for n in names]
     texts: dict[str, str] = {}
     for base in reversed(type(config).__mro__):
-        if dataclasses.is_dataclass(base):
-            texts |= _texts(base)
+        texts |= _texts(base)
     return [
         FieldDescription(
             field.name,
             value := getattr(config, field.name),
             texts.get(field.name) or _class_text(value),
-            field.registry if isinstance(field, RegistryField) else None,
+            getattr(field, "registry", None),
         )
-        for field in dataclasses.fields(config)
+        for field in config_fields(config)
     ]
 
 
@@ -426,7 +420,7 @@ def format_fields(config: Any) -> str:
     lines = []
     for heading, text in _described(config, ""):
         lines.append(heading)
-        lines += textwrap.wrap(text, width, initial_indent="    ", subsequent_indent="    ")
+        lines += wrap(text, width, initial_indent="    ", subsequent_indent="    ")
     return "\n".join(lines)
 
 
@@ -450,8 +444,7 @@ def _type_name(config: Any, field: FieldDescription) -> str:
     if field.registry is not None:
         return f"dictionary of {field.registry.what}s"
     if dataclasses.is_dataclass(config):
-        types = {each.name: each.type for each in dataclasses.fields(config)}
-        found = types[field.name]
+        found = field_types(config)[field.name]
         return found.__name__ if type(found) is type else re.sub(r"\b\w+\.(?=\w)", "", str(found))
     if isinstance(field.value, np.ndarray):
         return "list[float]"
@@ -461,8 +454,11 @@ def _type_name(config: Any, field: FieldDescription) -> str:
 @functools.cache
 def _texts(config: type) -> dict[str, str]:
     """Returns the texts of the fields that a class itself defines; empty without source."""
+    if not dataclasses.is_dataclass(config):  # pybind11 writes a signature if there is no text.
+        docs = {f.name: getattr(config, f.name).__doc__ or "" for f in config_fields(config)}
+        return {name: _paragraph(doc) for name, doc in docs.items() if not doc.startswith("(self)")}
     try:
-        lines = textwrap.dedent(inspect.getsource(config)).splitlines()
+        lines = dedent(inspect.getsource(config)).splitlines()
     except (OSError, TypeError):
         return {}
     (definition,) = ast.parse("\n".join(lines)).body
@@ -493,13 +489,6 @@ def _comment(lines: list[str], field: ast.stmt) -> str:
             break
         above.insert(0, line.strip().lstrip("# "))
     return " ".join(above)
-
-
-def _drake_text(config: Any, name: str) -> str:
-    text = getattr(type(config), name).__doc__ or ""
-    if text.startswith("(self)"):  # pybind11's signature, for a field without a docstring
-        return _class_text(getattr(config, name))
-    return _paragraph(text)
 
 
 def _class_text(value: Any) -> str:

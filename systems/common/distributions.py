@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from types import NoneType
 from typing import Any, NamedTuple, get_args, get_origin
 
+import numpy as np
 import yaml
 from pydrake.common import RandomGenerator, schema
 from pydrake.common.schema import (
@@ -60,14 +61,14 @@ def pickle_by_fields(*kinds: type) -> None:
 
 
 def _reduce(value: Any) -> tuple[Any, ...]:
-    fields = {field.name: getattr(value, field.name) for field in type(value).__fields__}
+    fields = {field.name: getattr(value, field.name) for field in config_fields(value)}
     return _from_fields, (type(value), fields)
 
 
 def _from_fields(kind: Any, fields: dict[str, Any]) -> Any:
     value = kind()
-    for name, held in fields.items():
-        setattr(value, name, held)
+    for name, part in fields.items():
+        setattr(value, name, part)
     return value
 
 
@@ -113,19 +114,14 @@ def is_distribution(value: Any) -> bool:
 
 def has_distributions(value: Any) -> bool:
     """Checks if `find_distributions` yields any, without paths and types, which cost more."""
-    if value is None or isinstance(value, str | float | int):
+    if value is None or isinstance(value, str | float | int | Rotation | type):
         return False
     if isinstance(value, dict | list):
         return any(map(has_distributions, value.values() if isinstance(value, dict) else value))
     if isinstance(value, Transform):
         return not value.IsDeterministic()
-    if dataclasses.is_dataclass(value):
-        return not isinstance(value, type) and has_distributions(vars(value))
-    fields = getattr(value, "__fields__", ())
-    is_plain = isinstance(value, Rotation | type)
-    return is_distribution(value) or (
-        not is_plain and any(has_distributions(getattr(value, field.name)) for field in fields)
-    )
+    fields = config_fields(value)
+    return is_distribution(value) or any(has_distributions(getattr(value, f.name)) for f in fields)
 
 
 def distribution_text(distribution: Any) -> str:
@@ -134,24 +130,16 @@ def distribution_text(distribution: Any) -> str:
 
 
 def find_distributions(config: Any, path: FieldPath = ()) -> Iterator[DrawnField]:
-    """Yields the distributions in a configuration, and transforms that have one.
-
-    Args:
-        path: of the configuration.
-
-    Raises:
-        ValueError: for a distribution in a field that is not of numbers, or an invalid one.
-    """
-    parts = () if isinstance(config, Transform | Rotation) else _fields(config)
-    for name, value, kind in parts:
-        yield from _find(config, (*path, name), value, kind)
+    """Yields the distributions in the configuration at `path`, and transforms that have one; raises
+    ValueError for a distribution in a field that is not of numbers, or an invalid one."""
+    for field in () if isinstance(config, Transform | Rotation) else config_fields(config):
+        yield from _find(config, (*path, field.name), getattr(config, field.name), field.type)
 
 
-def _fields(config: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Yields the names, values and types of a configuration's fields."""
-    drake = getattr(config, "__fields__", ())
-    for field in dataclasses.fields(config) if dataclasses.is_dataclass(config) else drake:
-        yield field.name, getattr(config, field.name), field.type
+def config_fields(config: Any) -> tuple[Any, ...]:
+    """Returns the fields of a dataclass or of a type of Drake's; none of other values."""
+    is_ours = dataclasses.is_dataclass(config)
+    return dataclasses.fields(config) if is_ours else tuple(getattr(config, "__fields__", ()))
 
 
 def _find(holder: Any, path: FieldPath, value: Any, kind: Any) -> Iterator[DrawnField]:
@@ -191,19 +179,13 @@ def _check(path: FieldPath, distribution: Any, kind: Any) -> None:
             value == int(value) for value in distribution.values
         )
         require(whole, name, "a !UniformDiscrete of whole numbers", text)
-    parts = {field: value for field, value, _ in _fields(distribution)}
+    parts = {field.name: getattr(distribution, field.name) for field in config_fields(distribution)}
     require(len(parts.get("values", [0])) > 0, f"values of {name}", "at least one", text)
     if "max" in parts:
-        valid = _all(parts["min"], parts["max"])
+        valid = np.all(parts["min"] <= parts["max"])
         require(valid, f"min of {name}", "at most its max", text)
     if "stddev" in parts:
-        require(_all(0.0, parts["stddev"]), f"stddev of {name}", "at least 0", text)
-
-
-def _all(lower: Any, upper: Any) -> bool:
-    """Checks lower <= upper, also by components."""
-    below = lower <= upper
-    return bool(below if isinstance(below, bool) else below.all())
+        require(np.all(parts["stddev"] >= 0.0), f"stddev of {name}", "at least 0", text)
 
 
 def sample_distributions[Configuration](
@@ -211,11 +193,8 @@ def sample_distributions[Configuration](
 ) -> Configuration:
     """Returns the configuration with values drawn from its distributions, or itself without any.
 
-    Each has a random stream of its own, of the seed and its path: a further distribution changes
-    none of the other values.
-
-    Args:
-        path: of the configuration in that to which the seed belongs.
+    Each has a random stream of its own, of the seed and its path, which begins with `path`: a
+    further distribution changes none of the other values.
     """
     if not has_distributions(config):
         return config
@@ -240,16 +219,11 @@ def draw(distribution: Any, seed: int, name: str) -> Any:
 
 
 def take_distributions(text: str, path: FieldPath = ()) -> tuple[str, dict[FieldPath, Any]]:
-    """Returns a YAML text without the distributions in it, and these by their paths.
-
-    Items of lists become 0. Transforms keep theirs.
-
-    Args:
-        path: of the text, where the paths begin.
-    """
-    root = yaml.compose(text, yaml.SafeLoader) if _TAG.search(text) else None
-    if root is None:
+    """Returns a YAML text without the distributions in it, and these by their paths, which begin
+    with `path`. Items of lists become 0. Transforms keep theirs."""
+    if not _TAG.search(text):
         return text, {}
+    root = yaml.compose(text, yaml.SafeLoader)
     for _, again in yaml_collections(root):  # Taking one from a node that stands twice takes both.
         require(not again, "YAML with distributions", "without *", "*", "write it out")
     found: dict[FieldPath, Any] = {}
@@ -258,30 +232,28 @@ def take_distributions(text: str, path: FieldPath = ()) -> tuple[str, dict[Field
 
 
 def _take(node: yaml.Node, path: FieldPath, found: dict[FieldPath, Any]) -> None:
-    if isinstance(node, yaml.MappingNode):
-        kept = []
-        for key, value in node.value:
-            inner = (*path, key.value)
-            if value.tag in _KINDS and not _TRANSFORM.fullmatch(key.value):
-                found[inner] = _read(value, inner)
-                continue
-            kept.append((key, value))
-            if not _TRANSFORM.fullmatch(key.value):
-                _take(value, inner, found)
-        node.value = kept
-    elif isinstance(node, yaml.SequenceNode):
-        for index, value in enumerate(node.value):
-            if value.tag in _KINDS:
-                found[(*path, index)] = _read(value, (*path, index))
-                node.value[index] = yaml.ScalarNode("tag:yaml.org,2002:int", "0")
-            else:
-                _take(value, (*path, index), found)
+    is_list = isinstance(node, yaml.SequenceNode)
+    if not isinstance(node, yaml.CollectionNode):
+        return
+    kept = []
+    for index, item in enumerate(node.value):
+        key, value = (index, item) if is_list else (item[0].value, item[1])
+        inner = (*path, key)
+        if not is_list and _TRANSFORM.fullmatch(key):
+            kept.append(item)
+        elif value.tag in _KINDS:
+            found[inner] = _read(value, inner)
+            kept += [yaml.ScalarNode("tag:yaml.org,2002:int", "0")] if is_list else []
+        else:
+            _take(value, inner, found)
+            kept.append(item)
+    node.value = kept
 
 
 def _read(node: yaml.Node, path: FieldPath) -> Any:
     kind = _KINDS[node.tag]
     names = {key.value for key, _ in node.value} if isinstance(node, yaml.MappingNode) else None
-    known = [field.name for field in kind.__fields__]
+    known = [field.name for field in config_fields(kind)]
     form = f"{node.tag} {{{', '.join(f'{name}: ...' for name in known)}}}"
     require(names == set(known), dotted(path), form, yaml.serialize(node).strip())
     node.tag = "tag:yaml.org,2002:map"
@@ -298,22 +270,15 @@ def dump_config(config: Any) -> str:
         field.put([] if isinstance(field.distribution, DistributionVector) else 0)
     root = yaml.compose(str(yaml_dump_typed(plain)), yaml.SafeLoader)
     for field in drawn:
-        holder = root
-        for name in field.path[:-1]:
-            holder = holder.value[_row(holder, name)]
-            holder = holder[1] if isinstance(holder, tuple) else holder
-        row = _row(holder, field.path[-1])
+        rows, row, node = [], 0, root
+        for name in field.path:
+            rows = node.value
+            keys = [each[0].value for each in rows] if isinstance(node, yaml.MappingNode) else []
+            row = keys.index(str(name)) if keys else int(name)
+            node = rows[row][1] if keys else rows[row]
         node = _node(field.distribution)
-        held = holder.value[row]
-        holder.value[row] = (held[0], node) if isinstance(held, tuple) else node
+        rows[row] = (rows[row][0], node) if isinstance(rows[row], tuple) else node
     return yaml.serialize(root)
-
-
-def _row(node: Any, name: str | int) -> int:
-    """Returns the row of a key, or the index, in the value of a YAML node."""
-    if isinstance(node, yaml.MappingNode):
-        return next(k for k, (key, _) in enumerate(node.value) if key.value == str(name))
-    return int(name)
 
 
 def _node(distribution: Any) -> yaml.Node:

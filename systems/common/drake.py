@@ -62,14 +62,8 @@ def vector_output(system: System, name: str, context: Context) -> np.ndarray:
     return np.asarray(system.GetOutputPort(name).Eval(context))
 
 
-def optional_input(system: System, name: str, context: Context) -> np.ndarray | None:
-    """Returns the vector at an input port, None if the port is not connected."""
-    port = system.GetInputPort(name)
-    return np.asarray(port.Eval(context)) if port.HasValue(context) else None
-
-
-def optional_value(system: System, name: str, context: Context) -> Any:
-    """Returns the value at an abstract input port, None if the port is not connected."""
+def optional_input(system: System, name: str, context: Context) -> Any:
+    """Returns the vector or value at an input port, None if the port is not connected."""
     port = system.GetInputPort(name)
     return port.Eval(context) if port.HasValue(context) else None
 
@@ -88,14 +82,11 @@ def connect(builder: DiagramBuilder, source: OutputPort, target: InputPort) -> N
 
     An image of size 0 stands for any size.
     """
-    given, taken = _content(source), _content(target)
-    kinds = (source.get_data_type(), given[0]), (target.get_data_type(), taken[0])
-    sizes_differ = given[1] != taken[1] and all(map(np.prod, (given[1], taken[1])))
-    if kinds[0] != kinds[1] or sizes_differ:
-        raise ValueError(
-            f"{_describe(target)} must be of the type and size of its source, got "
-            f"{_describe(source)}"
-        )
+    (kind, given), (expected, size) = _content(source), _content(target)
+    same_type = (kind, source.get_data_type()) == (expected, target.get_data_type())
+    fits = same_type and (given == size or not all(map(np.prod, (given, size))))
+    if not fits:
+        require(False, _describe(target), "of the type and size of its source", _describe(source))
     builder.Connect(source, target)
 
 
@@ -118,18 +109,14 @@ def _content(port: InputPort | OutputPort) -> tuple[str, tuple[int, ...]]:
 def _describe(port: InputPort | OutputPort) -> str:
     kind = "input" if isinstance(port, InputPort) else "output"
     content, size = _content(port)
-    what = f"{content} of {'x'.join(map(str, size))}" if content else "not a vector"
-    what = f"a {what}" if content == "vector" else what
-    system = type(port.get_system()).__name__
-    return f"the {kind} {port.get_name()!r} of {system} ({what})"
+    article = "a " if content == "vector" else ""
+    what = f"{article}{content} of {'x'.join(map(str, size))}" if content else "not a vector"
+    return f"the {kind} {port.get_name()!r} of {type(port.get_system()).__name__} ({what})"
 
 
 def weak_callback(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a callback for a bound method that does not keep its system alive.
-
-    Drake keeps callbacks of abstract output ports and cache entries as long as the system lives.
-    A bound method would keep the system, and the Diagram around it, alive permanently.
-    """
+    """Returns a callback for a bound method that does not keep its system, and the Diagram, alive:
+    Drake keeps callbacks of abstract output ports and cache entries."""
     reference = weakref.WeakMethod(method)
 
     def call(*arguments: Any) -> Any:
@@ -202,8 +189,8 @@ def system_template(
     """Defines a system for several scalar types by a function from the type to the class.
 
     As Drake's `TemplateSystem.define`, but the class has an `__init__`, with the keyword
-    `converter` for its base. A conversion constructs the system again with the same arguments. A
-    subclass does not support conversion, unless it is a template.
+    `converter` for its base. A conversion calls it with the same arguments. A subclass supports
+    conversion only if it is a template.
     """
 
     def define(instantiate: Callable[[Any], type[_S]]) -> _Template[_S]:

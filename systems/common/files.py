@@ -43,9 +43,7 @@ def written_atomically(path: Path, check: Callable[[Path], None] | None = None) 
     """Yields a temporary path next to `path` that is renamed to `path` when the block ends.
 
     An exception in the block removes the temporary file; `path` stays. An OSError names `path`.
-
-    Args:
-        check: raises OSError for a file that its writer has silently left incomplete.
+    `check` raises OSError for a file that its writer has silently left incomplete.
     """
     partial = _temporary(path, path.stem, path.suffix)  # Many writers choose the format by suffix.
     try:
@@ -79,10 +77,8 @@ def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
 def folder_written_atomically(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Yields a temporary folder next to `path` that is renamed to `path` when the block ends.
 
-    An exception in the block removes the temporary folder. An OSError names `path`.
-
-    Args:
-        replace: replaces a folder at `path`, which otherwise stays.
+    An exception in the block removes the temporary folder. An OSError names `path`. A folder at
+    `path` stays, unless `replace` is true.
     """
     path = path.resolve()  # of a link, what it names
     partial, replaced = _temporary(path, path.name), _temporary(path, path.name, _REPLACED)
@@ -95,9 +91,11 @@ def folder_written_atomically(path: Path, *, replace: bool = False) -> Iterator[
                 _flush(file)
             if replace and path.is_dir():
                 path.rename(replaced)
+            try:
                 partial.rename(path)
-            else:
-                _rename_unless_taken(partial, path)
+            except OSError as error:
+                if replaced.exists() or error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+                    raise
     finally:
         if replaced.exists() and not path.exists():
             replaced.rename(path)
@@ -316,14 +314,6 @@ def _flush(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _rename_unless_taken(folder: Path, path: Path) -> None:
-    try:
-        folder.rename(path)
-    except OSError as error:
-        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
-            raise
 
 
 def _is_running(pid: int) -> bool:

@@ -32,12 +32,8 @@ def map_processes[Work, Result](
 ) -> Generator[Result]:
     """Yields `function` of each piece of work as it ends, in any order.
 
-    The worker processes end with this one, even if it is killed.
-
-    Args:
-        function: at module level, as processes receive it by name.
-        work: taken as processes become free, and one ahead.
-        jobs: number of processes; with 1, all is done in this one.
+    The `jobs` worker processes, this one if it is 1, take work as they become free, and one ahead.
+    They receive the function by name, from its module, and end with this one, even if it is killed.
     """
     from joblib import Parallel, delayed
     from joblib.externals.loky import get_reusable_executor
@@ -65,20 +61,14 @@ def map_processes[Work, Result](
 def run_in_subprocess[Work, Result](
     what: str, function: Callable[[Work], Result], work: Work
 ) -> Result:
-    """Returns `function` of `work`, called in another process that native code may end.
-
-    Args:
-        what: the work and its files, for messages.
-        function: at module level, as the process receives it by name.
-    """
+    """Returns `function` of `work`, see `map_processes`, called in another process that native code
+    may end; messages begin with `what`."""
     try:
         [result] = map_processes(function, [work], 2)
     except (WorkerEndedError, RuntimeError) as error:
         why = "its process was ended" if isinstance(error, WorkerEndedError) else f"{error}"
-        raise OSError(
-            f"{what}: {why}, perhaps out of disk space or memory; free some and run the command "
-            "again"
-        ) from error
+        remedy = "perhaps out of disk space or memory; free some and run the command again"
+        raise OSError(f"{what}: {why}, {remedy}") from error
     return result
 
 
@@ -129,10 +119,7 @@ def require_renderer(device: str) -> None:
 
 
 def keep_freed_memory() -> None:
-    """Lets glibc keep freed memory of tensors instead of returning it to the system.
-
-    Has no effect with other C libraries.
-    """
+    """Lets glibc, if it is the C library, keep freed memory of tensors for the next."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_MMAP_THRESHOLD, _MAX_THRESHOLD)

@@ -18,18 +18,8 @@ _MAX_FRACTION = 0.02  # maximum fraction of the time for checkpoints
 
 
 class Progress(tqdm):
-    """Shows progress on standard error: `tqdm` in a terminal; elsewhere a line at the beginning,
-    one per minute, and one at the end of long work.
-
-    Args:
-        iterable: items to count, or None to count by `update`.
-        desc: such as "rendering frames".
-        total: number of items; the length of `iterable` if None.
-        initial: number of items that are done.
-        unit: singular noun for an item.
-        delay: [s] before anything is shown.
-        keywords: of `tqdm`.
-    """
+    """Shows progress on standard error: `tqdm` in a terminal, with its arguments; elsewhere a line
+    at the beginning, one per minute, and one at the end of long work."""
 
     monitor_interval = 0  # No thread: Drake aborts if another thread frees its objects.
 
@@ -38,10 +28,6 @@ class Progress(tqdm):
         iterable: Iterable[Any] | None = None,
         desc: str = "",
         total: float | None = None,
-        *,
-        initial: float = 0,
-        unit: str = "",
-        delay: float = 0.0,
         **keywords: Any,
     ) -> None:
         self._lines = not sys.stderr.isatty()
@@ -52,19 +38,8 @@ class Progress(tqdm):
         elif total is not None or isinstance(iterable, Sized):
             keywords = {"bar_format": _BAR} | keywords
         columns, rows = _terminal_size()
-        super().__init__(
-            iterable,
-            desc,
-            total,
-            initial=initial,
-            unit=unit,
-            delay=delay,
-            miniters=1,
-            ncols=columns,
-            nrows=rows,
-            file=sys.stderr,
-            **keywords,
-        )
+        given = {"unit": "", "miniters": 1, "ncols": columns, "nrows": rows, "file": sys.stderr}
+        super().__init__(iterable, desc, total, **given | keywords)
 
     def display(self, msg: str | None = None, pos: int | None = None) -> None:
         """Shows the bar, or prints a line if the last one is a minute old."""
@@ -119,7 +94,7 @@ class CheckpointClock:
 
     @property
     def is_due(self) -> bool:
-        """True when another should be written."""
+        """Checks if another should be written."""
         return time.monotonic() >= self._next
 
     @contextmanager

@@ -39,11 +39,8 @@ def program() -> dict[str, str]:
 
 
 def revision() -> str:
-    """Returns the git revision of this checkout, with a digest of changed and untracked source.
-
-    Outside a checkout of splatpilot it is the version of the installation, with a digest of the
-    files of a wheel.
-    """
+    """Returns the git revision of this checkout, with a digest of changed and untracked source, or
+    else the version of the installation, with a digest of the files of a wheel."""
     checkout = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str:
@@ -78,11 +75,8 @@ def revision() -> str:
 
 
 class InfeasibleFlightError(ValueError):
-    """A random world, start or goal that leaves no collision-free path.
-
-    Other seeds of the scenario may be feasible, so a study counts the flight as failed and
-    continues. Every other exception stops it.
-    """
+    """A random world, start or goal that leaves no collision-free path: a study counts the flight
+    as failed and continues, while every other exception stops it."""
 
 
 TRAINING_SEEDS = 1_000_000

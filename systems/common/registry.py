@@ -28,12 +28,8 @@ class Registry[Entry]:
     or, without installation, is `my_package.hover:HoverConfig`. The attribute is the entry, or the
     type of its configurations, for which the module registers an entry when imported.
 
-    Entries with an attribute `config`, the type of their configurations, are found by these too.
-
-    Args:
-        what: thing that is registered, for messages.
-        group: group of the entry points.
-        entry_type: type of the entries.
+    Entries, of `entry_type`, with an attribute `config`, the type of their configurations, are
+    found by these too. Messages call them `what`.
     """
 
     def __init__(self, what: str, group: str, entry_type: type[Entry]) -> None:
@@ -46,26 +42,20 @@ class Registry[Entry]:
         that runs again, or `importlib.reload`, defines them."""
         config = getattr(entry, "config", None)
         again = [
-            other
+            known
             for known, other in self._entries.items()
             if (known == name or config is not None) and _qualified(other) == _qualified(entry)
         ]
-        if name in self._entries and self._entries[name] not in [entry, *again]:
+        if name not in again and self._entries.get(name, entry) != entry:
             raise ValueError(f"there is a {self.what} {name!r} already; choose another name")
-        for other in self.configs():
-            if (
-                config is not None
-                and config.__name__ == other.__name__
-                and _qualified_name(config) != _qualified_name(other)
-            ):
+        for other in self.configs() if config is not None else ():
+            ours, theirs = _qualified_name(config), _qualified_name(other)
+            if config.__name__ == other.__name__ and ours != theirs:
                 raise ValueError(
-                    f"{config.__module__}.{config.__name__} has the name of {other.__module__}."
-                    f"{other.__name__}, and files could not tell them apart; rename it"
+                    f"{ours} has the name of {theirs}, and files could not tell them apart; "
+                    "rename it"
                 )
-        for known, other in self._entries.items():
-            if other in again:
-                self._entries[known] = entry
-        self._entries[name] = entry
+        self._entries |= dict.fromkeys([*again, name], entry)
 
     def registered(self) -> list[str]:
         """Returns the names that are registered so far."""
@@ -162,12 +152,8 @@ def _qualified(entry: Any) -> tuple[str, ...]:
 
 
 def check_name(what: str, group: str, name: str, ours: Sequence[str]) -> None:
-    """Checks a name before the registry is imported, which may take seconds.
-
-    Args:
-        what, group: attributes of the registry.
-        ours: names that our own code registers there.
-    """
+    """Checks a name before the registry of `what` and `group`, where our own code registers `ours`,
+    is imported, which may take seconds."""
     known = [*ours, *(point.name for point in _entry_points(group, tuple(sys.path)))]
     if name not in known and not _ATTRIBUTE.fullmatch(name):
         raise ValueError(unknown(what, name, known, _OTHERS))

@@ -28,15 +28,11 @@ _MIN_SIMILARITY, _MARGIN, _MAX_NAMES = 0.6, 0.1, 3
 def require(valid: object, what: str, condition: str, value: object, remedy: str = "") -> None:
     """Raises ValueError, "<what> must be <condition>, got <value>; <remedy>", unless `valid`.
 
-    Args:
-        what: a field or option.
-        condition: such as "at least 1" or "in (0, 20] m/s".
-        remedy: left out if it is obvious.
+    The condition is such as "at least 1" or "in (0, 20] m/s".
     """
     if not valid:
-        raise ValueError(
-            f"{what} must be {condition}, got {value}" + (f"; {remedy}" if remedy else "")
-        )
+        after = f"; {remedy}" if remedy else ""
+        raise ValueError(f"{what} must be {condition}, got {value}{after}")
 
 
 @contextmanager
@@ -132,10 +128,8 @@ def bounded(default: Any, domain: str) -> Any:
         domain: interval with its unit, as "(0, 3600] s", or set of words, as "{3dgs, 2dgs}". It
             applies to each item of a list; None is always valid.
     """
-    metadata = {_DOMAIN: domain}
-    if callable(default):
-        return dataclasses.field(default_factory=cast(Any, default), metadata=metadata)
-    return dataclasses.field(default=default, metadata=metadata)
+    given: Any = {"default_factory" if callable(default) else "default": default}
+    return dataclasses.field(**given, metadata={_DOMAIN: domain})
 
 
 class Config:

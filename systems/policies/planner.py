@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, ValueProducer
 
 from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.common.drake import optional_value, weak_callback
+from splatpilot.systems.common.drake import optional_input, weak_callback
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import Config, bounded, require, require_type
 from splatpilot.systems.policies.base import Policy
@@ -127,7 +127,7 @@ class PrivilegedPlanner(Policy):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         time, obstacles = context.get_time(), None
-        if bodies := optional_value(self, "moving", context):
+        if bodies := optional_input(self, "moving", context):
             obstacles = bodies.along(self._field, bodies.time + self._lattice.sample_times)
         state, arrival = np.asarray(self._state_port.Eval(context)), self._time_of_arrival(context)
         hypotheses = plan(time, state, self._field, arrival, self._lattice, self._params, obstacles)

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from splatpilot.systems.collision.distance_field import DistanceField, Distances
-from splatpilot.systems.common.drake import optional_input, optional_value, vector_input
+from splatpilot.systems.common.drake import optional_input, vector_input
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, quadrotor_derivatives
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
@@ -196,7 +196,7 @@ class RangeFinderSensor(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         X_WB = cast(RigidTransform, self.GetInputPort("body_pose").Eval(context))
-        bodies = optional_value(self, "moving", context)
+        bodies = optional_input(self, "moving", context)
         field = bodies.among(self._field, bodies.time) if bodies else self._field
         direction_W, config = X_WB.rotation().multiply(self._direction_B), self._config
         distance = cast_ray(field, X_WB.translation(), direction_W, config.max_range)

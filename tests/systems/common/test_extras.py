@@ -7,7 +7,7 @@ import pytest
 from splatpilot.systems.common import extras
 from splatpilot.systems.common.extras import import_extra, missing_extra, require_opengl
 
-TRAINING = """
+PICTURE = """
 import numpy as np
 from pydrake.geometry import *
 from pydrake.math import RigidTransform
@@ -19,10 +19,7 @@ core = RenderCameraCore("", CameraInfo(8, 8, 1.0), ClippingRange(0.1, 1), RigidT
 rows = [np.ones(shape, np.float32) for shape in ((1, 3), (1, 4), (1, 3), (1,), (1, 1, 3))]
 engine = SplatRenderEngine(BakedScene(GaussianScene(*rows)))
 engine.RenderColorImage(ColorRenderCamera(core), ImageRgba8U(8, 8))
-import torch
-weights = torch.nn.Parameter(torch.zeros(2))
-weights.sum().backward()
-torch.optim.Adam([weights]).step()
+import triton._C.libtriton  # Optimizers of torch load it.
 """
 
 
@@ -47,12 +44,8 @@ def test_missing_extra_names_the_one_that_brings_a_package(package, extra):
 def test_missing_driver_is_an_error_that_says_what_to_install(opengl, monkeypatch):
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nonexistent")
     monkeypatch.setenv("DISPLAY", "")
-    require_opengl.cache_clear()
-    try:
-        with pytest.raises(OSError, match="apt install libegl1"):
-            require_opengl()
-    finally:
-        require_opengl.cache_clear()
+    with pytest.raises(OSError, match="apt install libegl1"):
+        require_opengl.__wrapped__()
 
 
 def test_triton_is_loaded_before_opengl_renders(monkeypatch):
@@ -64,6 +57,7 @@ def test_triton_is_loaded_before_opengl_renders(monkeypatch):
 
 
 @pytest.mark.usefixtures("opengl")
-def test_torch_trains_after_a_picture():
-    done = subprocess.run([sys.executable, "-c", TRAINING], capture_output=True, text=True)
+def test_triton_loads_after_a_picture():
+    pytest.importorskip("triton")
+    done = subprocess.run([sys.executable, "-c", PICTURE], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
