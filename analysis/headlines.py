@@ -237,7 +237,7 @@ def images(effort: Effort) -> Iterator[Headline]:
     ratio = rolling / milliseconds(partial(camera.render, X_WB), repeats)
     yield Headline("rolling shutter at 1 rad/s and 2 m/s, over none", ratio, "x", max=1.6)
 
-    from splatpilot.systems.splats import rasterize
+    from splatpilot.systems.splats.rasterization import rasterize
 
     tensors: dict[str, Any] = scene_tensors(world.gaussians, view, X_WCs[:1])
     tensors["render_mode"] = "RGB+MD"
@@ -343,7 +343,7 @@ def gpu_images(effort: Effort) -> Iterator[Headline]:
     """Measures batches of images of P02 by gsplat, which has no median depth."""
     import torch
 
-    from splatpilot.systems.splats import rasterize
+    from splatpilot.systems.splats.rasterization import rasterize
 
     kinds = {"depth 64x36": ("ED", 64, 36, 50_000), "RGB 160x120": ("RGB", 160, 120, 10_000)}
     counts = sorted({1, 16, 256, effort.vehicles})
@@ -363,7 +363,7 @@ def gpu_images(effort: Effort) -> Iterator[Headline]:
 
 def gpu_agreement(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     """Compares an image of P02 by gsplat's kernels with ours."""
-    from splatpilot.systems.splats import rasterize
+    from splatpilot.systems.splats.rasterization import rasterize
 
     ours, theirs = (
         rasterize(**_forest_views("RGB+ED", 320, 240, 1, each))[0].cpu() for each in ("cpu", device)

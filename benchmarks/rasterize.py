@@ -19,9 +19,10 @@ from pydrake.math import RigidTransform
 from splatpilot import _native
 from splatpilot.analysis.headlines import machine, milliseconds, scene_tensors
 from splatpilot.systems.common.files import find_data
-from splatpilot.systems.splats import rasterize, rasterize_surfels
 from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
+from splatpilot.systems.splats.rasterization import rasterize
 from splatpilot.systems.splats.scene import GaussianScene, color_to_sh
+from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
 from splatpilot.training.captures.capture import depth_points, pinhole
 from splatpilot.training.captures.capture_registry import read_capture
 

@@ -19,7 +19,6 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from random_scenes import random_scene as random_gaussians
 from reference_rasterizer import median_depth
 
-from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import (
     BakedScene,
@@ -29,6 +28,7 @@ from splatpilot.systems.splats.baked_scene import (
     create_renderer,
 )
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
+from splatpilot.systems.splats.rasterization import rasterize
 from splatpilot.systems.splats.scene import GaussianScene
 
 CAMERA = K, WIDTH, HEIGHT

@@ -16,8 +16,10 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from splatpilot import _native
-from splatpilot.systems.splats import rasterization, rasterize, rasterize_surfels
+from splatpilot.systems.splats import rasterization
 from splatpilot.systems.splats.baked_scene import create_renderer
+from splatpilot.systems.splats.rasterization import rasterize
+from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
 
 LEVELS = _native.simd_levels()
 INPUTS = (*SCENE, "viewmats", "backgrounds")

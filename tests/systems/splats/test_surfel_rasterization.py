@@ -12,8 +12,9 @@ from random_scenes import random_scene as random_gaussians
 from reference_rasterizer import SCENE, rotation_matrices, single_gaussian
 
 from splatpilot import _native
-from splatpilot.systems.splats import rasterize, surfel_rasterization
+from splatpilot.systems.splats import surfel_rasterization
 from splatpilot.systems.splats.baked_scene import create_renderer
+from splatpilot.systems.splats.rasterization import rasterize
 from splatpilot.systems.splats.surfel_rasterization import depth_to_normals, rasterize_surfels
 
 LEVELS = _native.simd_levels()
