@@ -207,7 +207,9 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
     as_read = Reading("as it was read", (capture.depth_camera or capture).K, capture.axes.R_BC)
     agreement = measure(as_read)
     readings = _pose_readings(as_read) + _depth_readings(as_read)
-    readings += _camera_readings(as_read, capture) + _fitted_readings(as_read, measure)
+    readings += _camera_readings(as_read, capture)
+    readings.append(_fit(_zoomed, as_read, measure, [0.1]))
+    readings.append(_fit(_shifted, as_read, measure, [0.05, 0.05]))
     others, color = _sorted_fits(measure, readings), None
     X_CW = capture.X_WCs[0].inverse()
     if all((X_CW @ X_WC).IsNearlyIdentity(1e-9) for X_WC in capture.X_WCs):
@@ -272,14 +274,9 @@ def _check_features(capture: Capture, pairs: int) -> CheckReport:
 
     as_read = Reading("as it was read", capture.K, R_BC)
     readings = _pose_readings(as_read) + _camera_readings(as_read, capture)
-    # A wrong principal point looks like a camera that is mounted askew.
-    readings += _fitted_readings(as_read, measure)[:1]
-    bend, _ = _minimize(
-        lambda x: min(measure(replace(as_read, bend=x[0])).error, 1.0), [0.1], 1e-3, 1e-7, 60
-    )
-    k1 = float(bend[0])
-    name = f"the images are still distorted: k1 = {k1:.2f} fits best"
-    readings.append(replace(as_read, name=name, bend=k1))
+    # A wrong principal point, which looks like a camera that is mounted askew, is not fitted.
+    readings.append(_fit(_zoomed, as_read, measure, [0.1]))
+    readings.append(_fit(_bent, as_read, measure, [0.1], (1e-3, 1e-7, 60)))
     agreement, others = measure(as_read), _sorted_fits(measure, readings)
     what = "the median distance of features from their epipolar lines, in focal lengths,"
     problem = _find_problem(agreement, others[0], _EPIPOLAR_TOLERANCE, what)
@@ -413,22 +410,35 @@ def _camera_readings(as_read: Reading, capture: Capture) -> list[Reading]:
     return readings
 
 
-def _fitted_readings(as_read: Reading, measure: Callable[[Reading], ReadingFit]) -> list[Reading]:
+def _zoomed(as_read: Reading, x: NDArray) -> Reading:
+    K = as_read.K.copy()
+    K[:2, :2] *= np.exp(x[0])
+    return replace(as_read, name=f"the focal length is wrong: {K[0, 0]:.1f} px fits best", K=K)
 
-    def changed(x: NDArray) -> Reading:
-        K = as_read.K.copy()
-        if len(x) == 1:
-            K[:2, :2] *= np.exp(x[0])
-            name = f"the focal length is wrong: {K[0, 0]:.1f} px fits best"
-        else:
-            K[:2, 2] += K[0, 0] * x
-            name = f"the principal point is wrong: ({K[0, 2]:.1f}, {K[1, 2]:.1f}) px fits best"
-        return replace(as_read, name=name, K=K)
 
-    def cost(x: NDArray) -> float:
-        return min(measure(changed(x)).error, 1.0)
+def _shifted(as_read: Reading, x: NDArray) -> Reading:
+    K = as_read.K.copy()
+    K[:2, 2] += K[0, 0] * x
+    name = f"the principal point is wrong: ({K[0, 2]:.1f}, {K[1, 2]:.1f}) px fits best"
+    return replace(as_read, name=name, K=K)
 
-    return [changed(_minimize(cost, s, 1e-4, 1e-6, 80)[0]) for s in ([0.1], [0.05, 0.05])]
+
+def _bent(as_read: Reading, x: NDArray) -> Reading:
+    k1 = float(x[0])
+    name = f"the images are still distorted: k1 = {k1:.2f} fits best"
+    return replace(as_read, name=name, bend=k1)
+
+
+def _fit(
+    change: Callable[[Reading, NDArray], Reading],
+    as_read: Reading,
+    measure: Callable[[Reading], ReadingFit],
+    steps: Sequence[float],
+    options: tuple[float, float, int] = (1e-4, 1e-6, 80),
+) -> Reading:
+    """Returns the change of a reading that fits best."""
+    x, _ = _minimize(lambda x: min(measure(change(as_read, x)).error, 1.0), steps, *options)
+    return change(as_read, x)
 
 
 def _minimize(
