@@ -11,6 +11,7 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy, grid_shape
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import require
+from splatpilot.systems.splats.lens import pixel_slopes
 
 _BLOCK = 8  # [voxels] edge of a block, the unit in which invisible space is skipped
 _CHUNK = 1024  # blocks fused at once
@@ -131,14 +132,6 @@ def _halve(image: np.ndarray) -> np.ndarray:
     return np.maximum(image[:, ::2], image[:, 1::2])
 
 
-def ray_slopes(shape: tuple[int, ...], K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns x / z (W,) and y / z (H,) of the pixels' rays in an image (H, W)."""
-    height, width = shape
-    x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
-    y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
-    return x, y
-
-
 def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
     """Computes n . (u, v, 1) at each pixel: n is the surface's unit normal, (u, v, 1) the ray.
 
@@ -148,8 +141,7 @@ def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
     """
     valid = (depth > 0.0) & np.isfinite(depth)
     w = np.where(valid, 1.0 / np.where(valid, depth, 1.0), np.float32(np.nan)).astype(np.float32)
-    u, v = (slopes.astype(np.float32) for slopes in ray_slopes(depth.shape, K))
-    v = v[:, None]
+    u, v = np.moveaxis(pixel_slopes(None, K, *depth.shape[::-1]).astype(np.float32), -1, 0)
 
     def slope(axis: int, focal_length: float) -> np.ndarray:
         missing = np.full_like(w.take([0], axis), np.nan)
@@ -176,11 +168,9 @@ def esdf_from_depth_images(
 ) -> Esdf:
     """Fuses depth images into a distance field that marks unobserved space.
 
-    Each image gives the voxels it sees a signed distance to the surface's tangent plane. These are
-    truncated and averaged with the cosine of incidence as weight (Curless and Levoy 1996). A voxel
-    is FREE if on average before a surface, OCCUPIED at most 3 voxels behind one, UNKNOWN if no
-    image saw it. Space less than 3 voxels behind an edge counts as occupied until another image
-    clears it.
+    Signed distances to the tangent planes of surfaces are truncated, and averaged with the cosine
+    of incidence as weight (Curless and Levoy 1996). A voxel is FREE if on average before a surface,
+    OCCUPIED at most 3 voxels behind one or an edge, UNKNOWN if no image saw it.
 
     Args:
         depths: images (H, W) float [m], planar depth; 0, NaN and negative pixels are unknown,
@@ -188,20 +178,16 @@ def esdf_from_depth_images(
         K: (3, 3) intrinsics [px]; pixel centers lie at +1/2.
         X_WCs: the camera's pose of each image (x right, y down, z forward).
         lower_W, upper_W: (3,) [m], the box to fill, see `bounds_of_depth_images`.
-        max_range: distance from the camera up to which space is seen [m]; a surface beyond it still
-            clears the space before it.
+        max_range: [m] of seen space; a surface beyond it still clears the space before it.
         swept_radius: unobserved space within this distance of the cameras' path is FREE [m].
     """
     fusion = DepthFusion(lower_W, upper_W, voxel_size)
     for depth, X_WC in _pair(depths, K, X_WCs, max_range, "fusing depth"):
         fusion.add(depth, np.asarray(K, dtype=float), X_WC, max_range)
     distance, seen = fusion.grids()
+    unknown = ~seen
     if swept_radius > 0.0:
-        swept = swept_space(X_WCs, lower_W, fusion.shape, voxel_size, swept_radius) & ~seen
-        distance[swept] = np.nan
-        unknown = ~(seen | swept)
-    else:
-        unknown = ~seen
+        unknown &= ~swept_space(X_WCs, lower_W, fusion.shape, voxel_size, swept_radius)
     occupied = seen & (distance <= 0.0)
     offset = np.where(seen, distance, np.float32(np.nan))
     return esdf_from_occupancy(occupied, unknown, lower_W, voxel_size, offset)
@@ -244,8 +230,8 @@ def bounds_of_depth_images(
     lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
     for depth, X_WC in _pair(depths, K, X_WCs, max_range, "bounding depth"):
         z = np.where(np.isfinite(depth), depth, 0.0)[::4, ::4]
-        x, y = np.meshgrid(*(slopes[::4] for slopes in ray_slopes(depth.shape, K)))
-        ray = np.stack([x, y, np.ones_like(x)], -1)
+        slopes = pixel_slopes(None, K, *depth.shape[::-1])[::4, ::4]
+        ray = np.dstack([slopes, np.ones_like(z)])
         reach = np.minimum(z, max_range / np.linalg.norm(ray, axis=-1))
         p_CQ = (reach[..., None] * ray)[z > 0.0]
         p_WQ = p_CQ @ X_WC.rotation().matrix().T + X_WC.translation()

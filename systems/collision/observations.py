@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 from scipy.ndimage import binary_dilation, label, maximum_filter
 
-from splatpilot.systems.collision.depth_fusion import ray_slopes
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import (
     Esdf,
@@ -25,6 +24,7 @@ from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.readers import read_archive
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import FAR
+from splatpilot.systems.splats.lens import pixel_slopes
 
 FORMAT_VERSION = 1
 HEADINGS = 8  # of a table of views, counterclockwise from the x axis
@@ -156,10 +156,10 @@ def _points(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Returns points p_WQ (n, 3) [m] of every `step`-th pixel of a depth image along both axes, and
     the mask (h, w) of those pixels that show a surface nearer than `far` [m]."""
-    x, y = np.meshgrid(*(slopes[step // 2 :: step] for slopes in ray_slopes(depth.shape, K)))
-    z = depth[step // 2 :: step, step // 2 :: step]
+    every = (slice(step // 2, None, step),) * 2
+    z, slopes = depth[every], pixel_slopes(None, K, *depth.shape[::-1])[every]
     known = (z > 0.0) & (z < far)
-    p_CQ = np.stack([x, y, np.ones_like(x)], axis=-1)[known] * z[known, None]
+    p_CQ = np.column_stack([slopes[known], np.ones(np.count_nonzero(known))]) * z[known, None]
     return p_CQ @ X_WC.rotation().matrix().T + X_WC.translation(), known
 
 
