@@ -180,32 +180,28 @@ class FlightEnv(gymnasium.Env):
         if points:
             scenario.validate()
         self._take_flight(scenario, world)
+        context = self.simulator.get_mutable_context()
         if only_start_is_random(base):
-            self._restart(scenario)
+            world = self.parts.world  # with moving obstacles
+            state = sample_initial_state(scenario, world)
+            p_WG = goal_position(scenario, world)
+            context.SetTime(0.0)
+            self.diagram.SetDefaultContext(context)
+            set_state(self.parts.plant.GetMyMutableContextFromRoot(context), state)
+            source: Any = self.parts.goal.get_system()
+            goal = source.get_mutable_source_value(source.GetMyMutableContextFromRoot(context))
+            goal.SetFromVector(p_WG)
+            if self._flight.native:
+                self._flight.native.begin(state, p_WG)
         else:
-            context = self.simulator.get_mutable_context()
             self.diagram.SetRandomContext(context, RandomGenerator(scenario.seed))
         self._vehicles = self._flight.vehicles()
         self._previous = np.zeros((1, *cast(Box, self.action_space).shape))
         hover = decisions(self.config, self._previous, self._vehicles.states)
-        self._action.FixValue(self.simulator.get_mutable_context(), hover[0])
+        self._action.FixValue(context, hover[0])
         self.simulator.Initialize()
         self._steps, self._ended = 0, False
         return self._observe(), {}
-
-    def _restart(self, scenario: Scenario) -> None:
-        """Sets the Context of the diagram of a world to the start of a flight."""
-        world = self.parts.world
-        state, p_WG = sample_initial_state(scenario, world), goal_position(scenario, world)
-        context = self.simulator.get_mutable_context()
-        context.SetTime(0.0)
-        self.diagram.SetDefaultContext(context)
-        set_state(self.parts.plant.GetMyMutableContextFromRoot(context), state)
-        source: Any = self.parts.goal.get_system()
-        goal = source.get_mutable_source_value(source.GetMyMutableContextFromRoot(context))
-        goal.SetFromVector(p_WG)
-        if self._flight.native:
-            self._flight.native.begin(state, p_WG)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Flies for one period with an action in [-1, 1]."""

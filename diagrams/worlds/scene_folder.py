@@ -190,7 +190,11 @@ def read_scene_folder(path: str | Path, *, metric: bool = True, hatched: bool = 
     gaussians = read_gaussians(path)
     num_observed = len(gaussians)
     if metadata.frontier:
-        gaussians = gaussians.merged_with(_paint_frontier(read_ply(path / FRONTIER), hatched))
+        frontier = read_ply(path / FRONTIER)
+        stripe = np.floor(2.0 * frontier.means.sum(axis=1) / _STRIPE).astype(int) % 2
+        shade = _SHADES[stripe] if hatched else np.full(len(frontier), _PLAIN)
+        sh = np.repeat(color_to_sh(shade)[:, None, None], 3, axis=2)
+        gaussians = gaussians.merged_with(replace(frontier, sh=sh.astype(np.float32)))
     esdf = Esdf.load(path / ESDF)
     stated = np.array([metadata.lower_W, metadata.upper_W])
     found = np.array([esdf.lower_W, esdf.upper_W])
@@ -377,11 +381,3 @@ def _draw(esdf: Esdf, centers: NDArray[np.float64], normals: NDArray[np.float64]
     extent = _COVERAGE * np.sqrt(12.0 * variance[:, [2, 1]]) * esdf.voxel_size
     surfels = Surfels(p, R_WP[:, :, 0], R_WP[:, :, 2], extent)
     return to_gaussians(surfels, np.full((len(p), 3), _PLAIN), 0.99)
-
-
-def _paint_frontier(frontier: GaussianScene, hatched: bool) -> GaussianScene:
-    """Paints a frontier plain, or in stripes."""
-    stripe = np.floor(2.0 * frontier.means.sum(axis=1) / _STRIPE).astype(int) % 2
-    shade = _SHADES[stripe] if hatched else np.full(len(frontier), _PLAIN)
-    sh = np.repeat(color_to_sh(shade)[:, None, None], 3, axis=2)
-    return replace(frontier, sh=sh.astype(np.float32))
