@@ -247,8 +247,7 @@ def _write_tables(out: Path, result: AblationResult, config: ReconstructConfig) 
 
 
 def _write_grid(path: Path, capture: Capture, out: Path, result: AblationResult) -> None:
-    """Writes the image grid of the frame of median floaters in 3DGS from points, in the paper's
-    arms."""
+    """Writes the image grid of the frame of median floaters in 3DGS from points."""
     arms = result.captures[capture.name]
     frames = arms["3dgs_points"].frames
     ordered = sorted(frames, key=lambda i: frames[i].floater_fraction or 0.0)

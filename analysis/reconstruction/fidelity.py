@@ -186,8 +186,7 @@ class FidelityStudy:
 
 
 def choose_held_out(frames: int, stretches: Sequence[int], kept: int) -> list[int]:
-    """Returns the indices of held-out frames: stretches of these lengths in turn, between `kept`
-    frames each."""
+    """Returns the held-out frames: stretches of these lengths in turn, `kept` frames apart."""
     held_out: list[int] = []
     start = kept
     for length in cycle(stretches):

@@ -175,8 +175,7 @@ class SceneViews:
     def panels(
         self, frame: CaptureFrame, depths: Scale, errors: Scale, labels: tuple[str, str]
     ) -> list[Panel]:
-        """Returns panels of a frame, its exposed view, true and rendered depth, and depth error;
-        the labels are of view and error."""
+        """Returns panels of a frame, its view, true and rendered depth, and labeled depth error."""
         view, truth = self.render(frame), frame.image / 255
         image, _ = fit_exposure(view.color, truth, self.metadata.vignetting, frame.valid)
         known = has_true_depth(frame.depth)
@@ -205,8 +204,7 @@ class SceneViews:
 
 
 def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMetrics:
-    """Measures a scene folder on the frames `SceneViews.measured`, and writes `metrics.json` and
-    `views.png` into it."""
+    """Measures a scene on `SceneViews.measured`; writes `metrics.json` and `views.png` into it."""
     views = SceneViews(scene, capture)
     try:
         lpips, missing = Lpips(), ""

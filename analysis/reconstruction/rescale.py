@@ -151,8 +151,7 @@ def run(
 
 
 def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
-    """Writes a scene folder with all lengths times `factor`, a closed frontier and new start and
-    goal, without metrics."""
+    """Writes a scene times `factor`, with a closed frontier, new start and goal, and no metrics."""
     _positive("factor", factor)
     if out.exists():
         raise ValueError(f"{out}: exists already; choose another folder for the scaled scene")

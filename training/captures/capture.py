@@ -146,8 +146,7 @@ def common_pinhole(lenses: Sequence[Lens]) -> Lens:
 
 
 def resampling_maps(lens: Lens, target: Lens) -> tuple[NDArray, NDArray] | None:
-    """Returns the maps for `cv2.remap` from images of `lens` to those of the pinhole `target`;
-    None if they are the same camera."""
+    """Returns the maps for `cv2.remap` from images of `lens` to `target`, None if equal."""
     if lens.project is None and np.array_equal(lens.K, target.K):
         return None
     rays = pixel_rays(target.K, target.width, target.height)[..., :2].reshape(-1, 2)
@@ -194,8 +193,7 @@ def project(
 def project_points(
     K: NDArray[np.float64], p_CQ: NDArray[np.float64], width: int, height: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp]]:
-    """Returns which of the points (N, 3) fall into an image, and the rows and columns (n,) of the
-    pixels that these fall into."""
+    """Returns which points (N, 3) fall into an image, and rows and columns (n,) of their pixels."""
     (u, v), z = project(K, *p_CQ.T), p_CQ[:, 2]
     inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     return inside, v[inside].astype(np.intp), u[inside].astype(np.intp)
@@ -348,8 +346,7 @@ class Capture:
         return np.where(self.load_valid(i), depth, np.float32(0))
 
     def registered_depth(self, i: int) -> NDArray[np.float32]:
-        """Returns the depth (height, width) [m] of frame i in the pixels of its image; 0 in invalid
-        pixels and if unknown."""
+        """Returns the depth (height, width) [m] of the pixels of image i; 0 if invalid, unknown."""
         depth, camera = self.measured_depth(i), self.depth_camera
         if depth is None:
             return np.zeros((self.height, self.width), np.float32)

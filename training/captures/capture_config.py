@@ -102,8 +102,7 @@ class CaptureConfig(Config):
         require_field(self, "topics", valid, "three names, of color, depth and poses")
 
     def settings(self) -> list[str]:
-        """Returns the fields other than the defaults, as `--set` takes them:
-        "depth_unit=5000.0", "scale.camera_height=1.6"."""
+        """Returns the fields other than the defaults, as `--set` takes them: "depth_unit=5.0"."""
         default = CaptureConfig()
         return [
             f"{prefix}{each.name}={json.dumps(value)}"

@@ -26,8 +26,7 @@ class MatchedPair:
 
 
 def match_frames(capture: Capture, count: int) -> list[MatchedPair]:
-    """Matches SIFT features of `count` frames, spread over the capture, each with the first of
-    some later frames in which they have moved enough."""
+    """Matches SIFT features of `count` frames, each with a later one in which they have moved."""
     found: dict[int, tuple] = {}
 
     def features(i: int) -> tuple:

@@ -52,8 +52,7 @@ _SAME_SHAPE = 0.02  # relative difference of aspect ratios below which depth sho
 
 
 def existing_file(file: Path) -> Path:
-    """Returns the file, or that of a name as other systems write it: with \\ for /, or with letters
-    and accents composed otherwise."""
+    """Returns the file, or that of a name with \\ for / or accents that are composed otherwise."""
     if not file.exists():
         for name in (str(file), str(file).replace("\\", "/")):
             for form in ("NFC", "NFD"):
@@ -167,8 +166,7 @@ def _open_exr(file: Path, **options: bool) -> Any:
 
 
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
-    """Returns the files of a folder by number, in order: the group of `pattern`, a regular
-    expression for the full name."""
+    """Returns the files of a folder by number, the group of a regular expression, in order."""
     if not folder.is_dir():
         raise FileNotFoundError(f"No such folder: {folder}")
     found = ((re.fullmatch(pattern, file.name), file) for file in folder.iterdir())
@@ -457,8 +455,7 @@ def _drop_other_sizes(
 
 
 def _drop_distant(frames: list[_Frame], messages: list[str]) -> list[_Frame]:
-    """Returns the frames that are not farther from the median position than 10 m and 20 times the
-    distance of four in five."""
+    """Drops frames that are over 10 m and 20 times the 80 % quantile from the median position."""
     if not frames:
         return frames
     p = np.array([frame.X_FB.translation() for frame in frames])

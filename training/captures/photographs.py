@@ -53,8 +53,7 @@ _MIN_POINTS = 100  # that are triangulated
 
 
 def image_files(path: Path) -> list[Path]:
-    """Returns the images in a folder, or in its folder `images`, that are photographs by their
-    suffix; none of an unbundled SOG."""
+    """Returns the images in a folder, or in its folder `images`; none of an unbundled SOG."""
     for folder in (path, path / "images"):
         if folder.is_dir() and not (folder / "means_l.webp").exists():
             suffixes = IMAGE_SUFFIXES | _UNREADABLE
@@ -133,8 +132,7 @@ def _one_camera(files: list[Path]) -> bool:
 
 
 def _register(work: tuple[Path, list[str], bool, CaptureConfig, Path]) -> None:
-    """Writes the largest model. Seeds and the order of images are fixed, so that threads do not
-    change it."""
+    """Writes the largest model, which does not depend on threads."""
     folder, names, is_one_camera, config, written = work
     temporary = written / "work"
     temporary.mkdir()

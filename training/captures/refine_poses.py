@@ -139,8 +139,7 @@ def compare_frames(
 
 
 def _sample(image: NDArray[np.float32], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns an image and its derivatives [1/px] along rows and columns, (3, n), at the image
-    coordinates u (2, n); zero outside."""
+    """Returns an image and its derivatives [1/px], (3, n), at u (2, n); zero outside."""
     x, y = (u - 0.5).clip(-9, 1e4).astype(np.float32)[:, None]
     values = [
         cv2.remap(image, x + a, y + b, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)[0]
@@ -274,8 +273,7 @@ def _corrections(
 
 
 def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capture:
-    """Returns a capture, as read from `path`, with refined poses of all its frames; the cache
-    keeps them."""
+    """Returns a capture, as read from `path`, with refined poses, which the cache keeps."""
     if not capture.has_depth:
         raise ValueError(f"{path}: capture.refine_poses needs depth, and it has none; omit it")
     settings = replace(config, cache="").settings()

@@ -186,8 +186,7 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
 
 
 def true_camera(capture: Path) -> Callable[[RigidTransform], CaptureFrame] | None:
-    """Returns a function that renders the world of a rendered capture at a pose X_WC in its camera;
-    None if the capture was not rendered."""
+    """Returns a function that renders the world of a rendered capture at X_WC; None of others."""
     recipe = rendered_world(capture)
     if recipe is None:
         return None

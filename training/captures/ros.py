@@ -72,8 +72,7 @@ def recognizes(path: Path) -> bool:
 
 
 def read(path: Path, config: CaptureConfig) -> Capture:
-    """Opens a bag. `config.topics` chooses among several topics; `config.intrinsics` replace the
-    bag's calibration."""
+    """Opens a bag, of `config.topics` and `config.intrinsics` if given."""
     if path.suffix in {".db3", ".mcap"}:
         raise ValueError(f"{path}: a part of a bag; name its folder, which holds {_METADATA}")
     files = sorted(path.iterdir()) if path.is_dir() else [path]

@@ -120,8 +120,7 @@ def _transform(
     p_WN: NDArray[np.float64] | float = 0.0,
     **changes: Any,
 ) -> Capture:
-    """Returns the capture in a world N with origin p_WN, rotated and with lengths times `scale`,
-    but its depth, and other `changes` of fields."""
+    """Returns the capture in a world N with origin p_WN and other units; its depth stays."""
     points, axes = capture.points, capture.axes
     return dataclasses.replace(
         capture,
@@ -220,8 +219,7 @@ def camera_height(capture: Capture) -> float:
 
 
 def _factor_from_depth(capture: Capture) -> float:
-    """Returns the median ratio of measured depth to that of the points: hidden points have a ratio
-    too small."""
+    """Returns the median ratio of measured depth to that of the points, of which few are hidden."""
     ratios = [np.zeros(0)]
     points = capture.points.p_WQ if capture.points is not None else np.zeros((0, 3))
     for i in range(len(capture)):

@@ -128,8 +128,7 @@ class BlockMeans:
 
 
 def _pixel_slope(w: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Returns the slope of inverse depth at each pixel along an axis [1/(m px)], 0 unless both
-    neighbors agree on it."""
+    """Returns the slope of inverse depth along an axis [1/(m px)], 0 where neighbors disagree."""
     step = np.diff(w, axis=axis)
     zero = np.zeros_like(w.take([0], axis))
     before, after = np.concatenate([zero, step], axis), np.concatenate([step, zero], axis)

@@ -48,8 +48,7 @@ def photometric_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2)
 
 
 def ssim_map(rendered: Tensor, target: Tensor) -> Tensor:
-    """Computes the structural similarity (N, C, H, W) about each pixel of N images (..., H, W, C),
-    with the window of `photometric_loss`."""
+    """Computes SSIM (N, C, H, W) about each pixel of N images (..., H, W, C)."""
     height, width, channels = rendered.shape[-3:]
     x, y = (t.reshape(-1, height, width, channels).movedim(-1, 1) for t in (rendered, target))
     offset = torch.arange(WINDOW, dtype=x.dtype, device=x.device) - WINDOW // 2

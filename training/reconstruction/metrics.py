@@ -204,8 +204,7 @@ def psnr_db(image: NDArray, truth: NDArray) -> float | None:
 
 
 def ssim(image: NDArray, truth: NDArray, seen: NDArray[np.bool_]) -> float | None:
-    """Returns the mean structural similarity of images (H, W, 3) in [0, 1], as in
-    `photometric_loss`, over the pixels `seen` (H, W); None without pixels."""
+    """Returns the mean SSIM of images (H, W, 3) over the pixels `seen` (H, W); None without any."""
     if not seen.any():
         return None
     a, b = (torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in (image, truth))

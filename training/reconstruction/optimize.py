@@ -245,8 +245,7 @@ class Optimization:
                         self._save()
 
     def take_step(self) -> None:
-        """Fits one image or, in some steps of a view with objects before the sky, their outlines
-        as depth cameras see them: without the blur of color cameras."""
+        """Fits an image or, in some steps, the outlines of objects before the sky, without blur."""
         config, splats, count = self._config, self.splats, len(self.splats)
         # Image and background color are random, but depend only on seed and step.
         n = len(self._views)

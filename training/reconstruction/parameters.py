@@ -226,8 +226,7 @@ class SplatParameters:
 
     @torch.no_grad()
     def rebuild(self, rows: Tensor, added: Mapping[str, Tensor] | None = None) -> None:
-        """Keeps the Gaussians `rows` (indices), in that order, and appends those `added`, with
-        averages of 0 in Adam and without limits."""
+        """Keeps the Gaussians `rows`, in that order, and appends those `added`, without limits."""
         for name, old in self._tensors.items():
             extra = old[:0] if added is None else added[name]
             self._tensors[name] = torch.cat([old[rows], extra]).requires_grad_()

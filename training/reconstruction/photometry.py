@@ -30,8 +30,7 @@ def radius_squared(width: int, height: int) -> NDArray[np.float64]:
 
 
 def vignette(vignetting: float, width: int, height: int) -> NDArray[np.float64]:
-    """Returns the brightness (height, width) of each pixel relative to the image's center, given
-    the logarithm of that of the corners."""
+    """Returns the brightness (height, width) relative to the center's, given the corners' log."""
     return np.exp(vignetting * radius_squared(width, height))
 
 
@@ -87,8 +86,7 @@ class ThinnedFrame:
         return self.X_WC.multiply(p_CQ.T), index
 
     def find(self, p_WQ: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Returns the indices of the points (3, n) that this view sees, and the flat index of the
-        pixel of each."""
+        """Returns the indices of the points (3, n) that this view sees, and of their pixels."""
         h, w = self.depth.shape
         p_CQ = self.X_WC.inverse().multiply(p_WQ).T
         K = self.K / [[self.stride], [self.stride], [1]]
@@ -99,8 +97,7 @@ class ThinnedFrame:
 
 
 def find_overlaps(views: Sequence[ThinnedFrame]) -> list[list[int]]:
-    """Returns, for each view, the indices of the views that see some of its points, itself among
-    them if it has any."""
+    """Returns, for each view, the indices of those that see some of its points, itself included."""
     X_CWs = np.stack([view.X_WC.inverse().GetAsMatrix34() for view in views]).astype(np.float32)
     KX_CWs = np.stack([view.K for view in views]).astype(np.float32) @ X_CWs  # (n, 3, 4)
     sizes = [np.multiply(view.stride, view.depth.shape[::-1]) for view in views]
@@ -250,8 +247,7 @@ def predict_gains(
 
 
 def fit_gain(color: Tensor, image: Tensor, valid: Tensor) -> float:
-    """Returns the least-squares factor from `color` (H, W, 3) to `image`, over unsaturated pixels
-    `valid` (H, W)."""
+    """Returns the least-squares factor from `color` to `image` (H, W, 3) in unsaturated pixels."""
     usable = (image < _BRIGHTNESS[1]) & valid[..., None]
     x, y = color[usable].double(), image[usable].double()
     return float((x * y).sum() / (x * x).sum().clamp(min=1e-9))

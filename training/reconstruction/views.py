@@ -114,8 +114,7 @@ class ReconstructionViews:
         return center, extent if extent > 1e-6 else 1.0
 
     def target(self, frame: CaptureFrame, gain: Tensor, background: Tensor) -> Tensor:
-        """Returns the image (H, W, 3) of a frame without gain and vignetting, about 0 to 1, with
-        `background` (3,) in the sky."""
+        """Returns the image (H, W, 3) of a frame without gain and vignetting, on `background`."""
         image = torch.from_numpy(frame.image).float()
         color = image.mul_((1 / (255 * gain * self.vignette))[..., None])
         color[torch.from_numpy(frame.depth >= FAR)] = background
