@@ -59,7 +59,7 @@ SMALLER = {
         "53248 steps": "16 steps",
         "Env(20, scenario=scenario, num_worlds=20": "Env(2, scenario=scenario, num_worlds=1",
         "< 50": "< 2",
-        'scenario="P01", observation=observed, r': "scenario=replace(scenario, timeout=1), r",
+        '"P01", observation=observed, r': "replace(scenario, timeout=1), observation=observed, r",
     },
     "monte_carlo": {
         'length=18", "timeout=20': 'length=9", "timeout=2',
