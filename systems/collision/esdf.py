@@ -64,13 +64,11 @@ def interpolate_grid(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Esdf:
-    """A signed distance field sampled at voxel centers and interpolated trilinearly.
+    """A signed distance field sampled at voxel centers and interpolated trilinearly; read-only.
 
     Values are extrapolated in the outermost half voxels. The gradient is the exact derivative of
-    the interpolant and jumps at the planes through voxel centers. The arrays are read-only.
-
-    Points p_WQ (..., 3) [m] are numpy arrays or torch tensors; results are of the same type, and
-    distances of tensors and of AutoDiffXd are differentiable.
+    the interpolant. Points p_WQ (..., 3) [m] are numpy arrays or torch tensors; results are of the
+    same type, and distances of tensors and of AutoDiffXd are differentiable.
     """
 
     distances: np.ndarray  # (nx, ny, nz) float32 [m]
@@ -132,32 +130,25 @@ class Esdf:
         """Returns signed distances (...,) [m] at the points, NaN outside the bounds."""
         if array_namespace(p_WQ) is not np or is_autodiff(p_WQ):
             return sample_field(self, p_WQ).distance
-        return self._interpolate(_points(p_WQ), with_gradient=False)[0]
+        box = self.lower_W, self.voxel_size
+        points = _points(p_WQ)
+        return interpolate_grid(self.distances, *box, points, self.occupied_outside, False)[0]
 
     def query(self, p_WQ: Any) -> FieldSample:
         """Returns distance, exact gradient of the interpolant and state at the points."""
-        if array_namespace(p_WQ) is not np:
-            return self._query_tensor(p_WQ)
-        p_WQ = _points(p_WQ)
-        distance, gradient = self._interpolate(p_WQ)
+        if (namespace := array_namespace(p_WQ)) is not np:
+            sample = self.query(p_WQ.detach().cpu().numpy())
+            distance, gradient = (p_WQ.new_tensor(array) for array in sample[:2])
+            distance = linearize(distance, gradient, p_WQ - p_WQ.detach())
+            state = namespace.as_tensor(sample.state, device=p_WQ.device)
+            return FieldSample(distance, gradient, state)
+        p_WQ, box = _points(p_WQ), (self.lower_W, self.voxel_size)
+        distance, gradient = interpolate_grid(self.distances, *box, p_WQ, self.occupied_outside)
         inside = ((p_WQ >= self.lower_W) & (p_WQ <= self.upper_W)).all(axis=-1)
         voxel = np.floor((p_WQ - self.lower_W) / self.voxel_size)
         voxel = np.fmin(np.fmax(voxel, 0.0), np.array(self.shape) - 1.0).astype(np.intp)
         states = self.states[voxel[..., 0], voxel[..., 1], voxel[..., 2]]
         state = np.where(inside, states, np.uint8(FieldState.OUTSIDE))
-        return FieldSample(distance, gradient, state)
-
-    def _interpolate(
-        self, p_WQ: np.ndarray, with_gradient: bool = True
-    ) -> tuple[np.ndarray, np.ndarray]:
-        box = self.lower_W, self.voxel_size
-        return interpolate_grid(self.distances, *box, p_WQ, self.occupied_outside, with_gradient)
-
-    def _query_tensor(self, p_WQ: Any) -> FieldSample:
-        sample = self.query(p_WQ.detach().cpu().numpy())
-        distance, gradient = (p_WQ.new_tensor(array) for array in sample[:2])
-        distance = linearize(distance, gradient, p_WQ - p_WQ.detach())
-        state = array_namespace(p_WQ).as_tensor(sample.state, device=p_WQ.device)
         return FieldSample(distance, gradient, state)
 
     def conservative(self) -> "Esdf":
@@ -167,8 +158,21 @@ class Esdf:
         leads out of them. At corners where two surfaces meet the interpolant is up to 0.75 voxel
         too large.
         """
-        distances = conservative_distances(self.distances, self.states, self.voxel_size)
-        return Esdf(distances, self.states, self.lower_W, self.voxel_size, occupied_outside=True)
+        states, size = self.states, self.voxel_size
+        to_faces = [np.minimum(i + 0.5, i[::-1] + 0.5) for i in map(np.arange, self.shape)]
+        x, y, z = (size * steps.astype(np.float32) for steps in to_faces)
+        distances = np.minimum(np.minimum(x[:, None, None], y[:, None]), z)
+        distances = np.minimum(self.distances, distances)
+        unknown = states == FieldState.UNKNOWN
+        if unknown.any():
+            free = states == FieldState.FREE
+            distances = np.minimum(distances, distance_to_voxels(unknown, size) - 0.5 * size)
+            # Depth in occupied and unknown space together: otherwise a ridge would run along the
+            # back of a wall that was seen from one side.
+            band = np.where(free & (distances < 2.0 * size), np.maximum(distances, 0.0), np.nan)
+            depth = distances_from_band(~free, band, size)
+            distances = np.where(free, distances, np.minimum(self.distances, depth))
+        return Esdf(distances, states, self.lower_W, size, occupied_outside=True)
 
     def scaled_by(self, factor: float) -> "Esdf":
         """Returns the same field with all lengths from the origin times `factor`."""
@@ -181,7 +185,7 @@ class Esdf:
         )
 
     def save(self, path: str | Path) -> None:
-        """Writes the field to `path`, by custom `esdf.npz`, atomically."""
+        """Writes the field, by custom `esdf.npz`, atomically."""
         with written_atomically(Path(path)) as partial, partial.open("wb") as file:
             np.savez_compressed(
                 file,
@@ -238,10 +242,10 @@ def distance_to_voxels(voxels: np.ndarray, voxel_size: float) -> np.ndarray:
 
 
 def occupancy_distances(occupied: np.ndarray, voxel_size: float) -> np.ndarray:
-    """Computes signed distances to the faces of occupied voxels, never too large if interpolated.
+    """Computes signed distances [m] to the faces of occupied voxels, negative in these.
 
-    At voxel centers it is the exact distance [m], less the excess of the trilinear interpolant in
-    the half voxels around: distances to an edge or corner are convex. Negative in occupied voxels.
+    They are exact at voxel centers, less the excess of the trilinear interpolant in the half voxels
+    around: distances to an edge or corner are convex.
     """
     if not occupied.any() or occupied.all():
         far = np.float32(_diagonal(occupied.shape, voxel_size))
@@ -284,12 +288,12 @@ def _between(values: np.ndarray) -> np.ndarray:
 
 
 def distances_from_band(occupied: np.ndarray, band: np.ndarray, voxel_size: float) -> np.ndarray:
-    """Continues signed distances from a band of known values around the surface.
+    """Continues signed distances from a band (nx, ny, nz) [m] around the surface, NaN elsewhere.
 
     Every voxel s of the band bounds the distance of a voxel x by |x - s| + |band(s)|, with the
     opposite sign of band(s) if s and x lie on different sides. The nearest s gives the first bound;
-    passing the s of the six face neighbors along, twice, finds tighter ones. The band (nx, ny, nz)
-    [m] is NaN where unknown; if it is empty, distances are the diagonal of the grid.
+    passing the s of the six face neighbors along, twice, finds tighter ones. Without a band,
+    distances are the diagonal of the grid.
     """
     sites = np.isfinite(band)
     if not sites.any():
@@ -320,36 +324,6 @@ def distances_from_band(occupied: np.ndarray, band: np.ndarray, voxel_size: floa
         np.copyto(site[:, *here], candidate, where=closer)
         np.copyto(offset[here], candidate_offset, where=closer)
     return sign * best * np.float32(voxel_size)
-
-
-def conservative_distances(
-    distances: np.ndarray, states: np.ndarray, voxel_size: float
-) -> np.ndarray:
-    """Computes distances with unknown voxels and all outside the grid taken as occupied.
-
-    In free voxels it is the distance [m] to the nearest occupied surface, face of an unknown voxel
-    or face of the grid; in the others minus the distance to free space.
-    """
-    unknown = states == FieldState.UNKNOWN
-    result = np.minimum(distances, _distance_to_faces(distances.shape, voxel_size))
-    if not unknown.any():
-        return result
-    free = states == FieldState.FREE
-    result = np.minimum(result, distance_to_voxels(unknown, voxel_size) - 0.5 * voxel_size)
-    # Depth in occupied and unknown space together: otherwise a ridge would run along the back of a
-    # wall that was seen from one side.
-    band = np.where(free & (result < 2.0 * voxel_size), np.maximum(result, 0.0), np.nan)
-    depth = distances_from_band(~free, band, voxel_size)
-    return np.where(free, result, np.minimum(distances, depth))
-
-
-def _distance_to_faces(shape: tuple[int, ...], voxel_size: float) -> np.ndarray:
-    """Returns the distance of voxel centers to the nearest face of the grid, (nx, ny, nz) [m]."""
-    x, y, z = (
-        voxel_size * np.minimum(np.arange(n) + 0.5, n - np.arange(n) - 0.5).astype(np.float32)
-        for n in shape
-    )
-    return np.minimum(np.minimum(x[:, None, None], y[:, None]), z)
 
 
 def _diagonal(shape: tuple[int, ...], voxel_size: float) -> float:
