@@ -219,7 +219,7 @@ def camera_height(capture: Capture) -> float:
 
 
 def _factor_from_depth(capture: Capture) -> float:
-    """Returns the median ratio of measured depth to that of the points, of which few are hidden."""
+    """Returns the median ratio of measured depth to that of the points; few are hidden."""
     ratios = [np.zeros(0)]
     points = capture.points.p_WQ if capture.points is not None else np.zeros((0, 3))
     for i in range(len(capture)):

@@ -16,7 +16,7 @@ from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.captures.colmap import model_folder
 from splatpilot.training.captures.up_and_scale import camera_height
 
-SHRINK = 0.25
+SHRINK, VIEWS = 0.25, room_views(K, 64, 48)
 # The world of a registration: any rotation, any unit of length.
 X_MW = RigidTransform(
     RotationMatrix.MakeXRotation(1.1) @ RotationMatrix.MakeYRotation(0.5), [3, 1, 2]
@@ -24,12 +24,7 @@ X_MW = RigidTransform(
 
 
 @pytest.fixture
-def views():
-    return room_views(K, 64, 48)
-
-
-@pytest.fixture
-def model(tmp_path, views):
+def model(tmp_path):
     """A folder of images with a model, whose points are seen by one image each."""
     path, rng = tmp_path / "castle", np.random.default_rng(0)
     model = pycolmap.Reconstruction()
@@ -37,7 +32,7 @@ def model(tmp_path, views):
     camera = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=params, camera_id=1)
     model.add_camera_with_trivial_rig(camera)
     (path / "images").mkdir(parents=True)
-    for i, view in enumerate(views):
+    for i, view in enumerate(VIEWS):
         cv2.imwrite(str(path / f"images/{i:02d}.png"), view.image[..., ::-1])
         X_MC = X_MW @ view.X_WC
         X_CM = RigidTransform(X_MC.rotation(), SHRINK * X_MC.translation()).inverse()
@@ -112,15 +107,15 @@ def test_distance_between_points(model):
     np.testing.assert_allclose(lengths(capture.X_WCs), lengths(CAMERA_POSES), rtol=1e-9)
 
 
-def test_depth_of_some_images(model, views):
+def test_depth_of_some_images(model):
     (model / "depth").mkdir()
     for i in (2, 5):
-        millimeters = np.round(1000 * views[i].depth).astype(np.uint16)
+        millimeters = np.round(1000 * VIEWS[i].depth).astype(np.uint16)
         cv2.imwrite(str(model / f"depth/{i:02d}.png"), millimeters)
     capture = read_capture(model, CaptureConfig(scale=ScaleConfig(depth_folder="depth")))
     assert capture.metric and capture.has_depth
     np.testing.assert_allclose(lengths(capture.X_WCs), lengths(CAMERA_POSES), rtol=0.02)
-    np.testing.assert_allclose(capture.frame(5).depth, views[5].depth, atol=0.001)
+    np.testing.assert_allclose(capture.frame(5).depth, VIEWS[5].depth, atol=0.001)
     assert capture.load_depth(0) is None and not capture.frame(0).depth.any()
 
 
@@ -162,7 +157,7 @@ def test_points_that_only_masked_pixels_show_are_left_out(model):
     assert (times >= 2).all()
 
 
-def test_images_in_subfolders_keep_their_paths(model, views):
+def test_images_in_subfolders_keep_their_paths(model):
     reconstruction = pycolmap.Reconstruction(model / "sparse/0")
     for image in reconstruction.images.values():
         i = image.image_id - 1
@@ -185,9 +180,9 @@ def test_images_in_subfolders_keep_their_paths(model, views):
     with pytest.raises(ValueError, match=r"several .* called '00.png'; choose one of cam0/00.png"):
         scaled("00.png", "cam1/01.png")
     (model / "depth/cam1").mkdir(parents=True)
-    np.save(model / "depth/cam1/02.npy", views[7].depth.astype(np.float32))
+    np.save(model / "depth/cam1/02.npy", VIEWS[7].depth.astype(np.float32))
     capture = read_capture(model, CaptureConfig(scale=ScaleConfig(depth_folder="depth")))
-    np.testing.assert_allclose(capture.frame(7).depth, views[7].depth, rtol=1e-5)
+    np.testing.assert_allclose(capture.frame(7).depth, VIEWS[7].depth, rtol=1e-5)
     assert capture.load_depth(2) is None
 
 

@@ -17,19 +17,15 @@ from splatpilot.training.captures.refine_poses import ComparedFrame, compare_fra
 K = pinhole(300.0, 304.0, 162.0, 118.0)
 
 
-@pytest.fixture
-def frames():
-    def views(poses, noise: float = 0.0, exposure: float = 1.0) -> list[ComparedFrame]:
-        rng = np.random.default_rng(5)
-        prepared = []
-        for i, view in enumerate(room_views(K, 320, 240, poses, finer=8.0)):
-            image = np.clip(view.image * exposure**i, 0, 255).astype(np.uint8)
-            depth = view.depth * (1 + noise * rng.standard_normal(view.depth.shape))
-            frame = CaptureFrame(image, depth.astype(np.float32), view.X_WC, K)
-            prepared.append(ComparedFrame.prepare(frame))
-        return prepared
-
-    return views
+def frames(poses, noise: float = 0.0, exposure: float = 1.0) -> list[ComparedFrame]:
+    rng = np.random.default_rng(5)
+    prepared = []
+    for i, view in enumerate(room_views(K, 320, 240, poses, finer=8.0)):
+        image = np.clip(view.image * exposure**i, 0, 255).astype(np.uint8)
+        depth = view.depth * (1 + noise * rng.standard_normal(view.depth.shape))
+        frame = CaptureFrame(image, depth.astype(np.float32), view.X_WC, K)
+        prepared.append(ComparedFrame.prepare(frame))
+    return prepared
 
 
 def moved(X_WC: RigidTransform, step: np.ndarray) -> RigidTransform:
@@ -56,7 +52,7 @@ def errors(poses: list[RigidTransform], truth: list[RigidTransform]) -> np.ndarr
     )
 
 
-def test_derivatives(frames):
+def test_derivatives():
     given = CAMERA_POSES[5:7]
     seen, h = frames(given), 1e-4
     for number in range(12):
@@ -92,7 +88,7 @@ def test_edges_and_holes_are_not_compared():
 
 
 @pytest.mark.parametrize(("noise", "left"), [(0.0, 0.1), (0.005, 0.3)])
-def test_drift_is_removed(frames, noise, left):
+def test_drift_is_removed(noise, left):
     given = drifting(CAMERA_POSES, 0.02, 0.02)
     refined = refine_poses(frames(CAMERA_POSES, noise, exposure=0.97), given)
     assert (errors(refined.X_WCs, CAMERA_POSES) < left * errors(given, CAMERA_POSES)).all()
@@ -102,7 +98,7 @@ def test_drift_is_removed(frames, noise, left):
     assert "poses moved by" in str(refined)
 
 
-def test_blind_frame_moves_with_its_neighbors(frames):
+def test_blind_frame_moves_with_its_neighbors():
     given = drifting(CAMERA_POSES, 0.02, 0.02)
     seen = frames(CAMERA_POSES)
     blind = CaptureFrame(
@@ -169,6 +165,6 @@ def test_without_depth(tmp_path):
     assert not (tmp_path / "cache").exists()
 
 
-def test_exact_poses_stay(frames):
+def test_exact_poses_stay():
     refined = refine_poses(frames(CAMERA_POSES), CAMERA_POSES)
     assert (errors(refined.X_WCs, CAMERA_POSES) < 1e-3).all()
