@@ -23,7 +23,11 @@ def test_noise_and_latency_reach_the_policy_and_repeat(post_world):
     def states(**noise) -> np.ndarray:
         observation = ObservationNoise(**noise)
         scenario = Scenario(timeout=0.6, policy=policy_named("reactive"), observation=observation)
-        return fly(BuildFlightDiagram(scenario, post_world, camera=False)).states
+        diagram = BuildFlightDiagram(scenario, post_world, camera=False)
+        systems = {"depth_noise": "depth_multiplicative", "delayed_pose": "latency"}
+        for name in (*systems, "color_noise"):
+            assert diagram.HasSubsystemNamed(name) == (systems.get(name) in noise)
+        return fly(diagram).states
 
     clean, late = states(), states(latency=0.03)
     stream = {"frame_rate": [10.0, 30.0], "jitter": 0.03, "frame_dropout": 0.2}
@@ -53,15 +57,6 @@ def test_grid_of_a_policy_is_that_of_its_cameras_images(post_world):
     assert 0.0 < grid.max() < 1.0
 
 
-def test_diagram_has_only_the_configured_systems(post_world):
-    noise = {"depth_dropout": 0.1, "color_noise": 0.1, "latency": 0.05}
-    for fields, systems in (({}, set()), (noise, {"depth_noise", "delayed_pose"})):
-        scenario = Scenario(policy=policy_named("reactive"), observation=ObservationNoise(**fields))
-        diagram = BuildFlightDiagram(scenario, post_world, camera=False)
-        names = {"depth_noise", "color_noise", "delayed_pose"}
-        assert {name for name in names if diagram.HasSubsystemNamed(name)} == systems
-
-
 @pytest.mark.parametrize("latency", [0.0, 0.1])
 def test_rolling_shutter_starts_where_the_vehicle_was(post_world, latency):
     policy = policy_named("reactive")
@@ -86,19 +81,18 @@ def test_rolling_shutter_starts_where_the_vehicle_was(post_world, latency):
 @pytest.mark.parametrize("policy", ["planner", "diffaero_tof", "diffaero_rgb"])
 def test_profiles_fly_every_policy_and_repeat(policy, post_world):
     scenario = load_config(
-        Scenario(timeout=0.5, policy=policy_named(policy)), overrides=["profile=realistic"]
+        Scenario(timeout=0.3, policy=policy_named(policy)), overrides=["profile=realistic"]
     )
-    first, again = (
-        fly(BuildFlightDiagram(scenario, post_world, camera=False)).states for _ in range(2)
+    first, again, other = (
+        fly(BuildFlightDiagram(replace(scenario, seed=k), post_world, camera=False)).states
+        for k in (0, 0, 1)
     )
     np.testing.assert_array_equal(first, again)
-    scenario.seed = 1
-    other = fly(BuildFlightDiagram(scenario, post_world, camera=False)).states
     assert np.any(other[-1] != first[-1])
 
 
 def test_matched_images_measure_the_depth_of_the_world():
-    overrides = ["world.length=16", "world.spacing=2.4", "policy=!DiffAeroConfig {}"]
+    overrides = ["world.length=12", "world.spacing=2.4", "policy=!DiffAeroConfig {}"]
     scenario = load_config(Scenario(seed=3), overrides=overrides)
     scenario.imaging.stereo = Stereo(matching=True)
     world = make_world(scenario.world, scenario.seed)

@@ -29,7 +29,6 @@ from splatpilot.systems.common.config import dump_config, load_config, parse_con
 from splatpilot.systems.common.validation import Config
 from splatpilot.systems.policies.reactive import Reactive
 from splatpilot.systems.sensing.imu import Imu, RangeFinder
-from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorParams, QuadrotorPlant
@@ -172,32 +171,26 @@ def test_a_decision_can_be_an_input_of_the_diagram(post_world, decision):
 
 
 def test_inputs_of_given_systems_are_connected_or_exported(post_world):
-    class Windy(QuadrotorPlant):
-        def __init__(self):
-            super().__init__(None, sample_initial_state(Scenario(), post_world))
-            self.DeclareVectorInputPort("gust", 3)
-
-    diagram = BuildFlightDiagram(Scenario(), post_world, camera=False, plant=Windy())
-    assert diagram.HasInputPort("plant_gust")
-
-    builder = DiagramBuilder()
-    plant = builder.AddNamedSystem("mine", Windy())
-    gust = builder.AddSystem(ConstantVectorSource(np.ones(3)))
-    builder.Connect(gust.get_output_port(), plant.GetInputPort("gust"))
-    AddFlight(builder, Scenario(), post_world, plant=plant, camera=False)
-    assert not builder.Build().HasInputPort("plant_gust")
-
-
-def test_a_controller_may_also_read_what_the_policy_reads(post_world):
+    start = sample_initial_state(Scenario(), post_world)
+    plants = [QuadrotorPlant(None, start) for _ in range(2)]
+    for plant in plants:
+        plant.DeclareVectorInputPort("gust", 3)
     controller = block(
         {"state": 13, "acceleration": 3, "goal": 3},
         command=(4, lambda read, time: [9.81 + read("goal")[2], 0, 0, 0]),
     )
-    systems = {"policy": block(acceleration=3), "controller": controller}
+    systems = {"policy": block(acceleration=3), "controller": controller, "plant": plants[0]}
     diagram = BuildFlightDiagram(Scenario(), post_world, camera=False, **systems)
-    assert not diagram.HasInputPort("controller_goal")
+    assert diagram.HasInputPort("plant_gust") and not diagram.HasInputPort("controller_goal")
     command = diagram.GetOutputPort("command").Eval(diagram.CreateDefaultContext())
     assert command[0] == pytest.approx(9.81 + post_world.p_WG[2])
+
+    builder = DiagramBuilder()
+    plant = builder.AddNamedSystem("mine", plants[1])
+    gust = builder.AddSystem(ConstantVectorSource(np.ones(3)))
+    builder.Connect(gust.get_output_port(), plant.GetInputPort("gust"))
+    AddFlight(builder, Scenario(), post_world, plant=plant, camera=False)
+    assert not builder.Build().HasInputPort("plant_gust")
 
 
 class MineConfig:
@@ -294,29 +287,21 @@ def test_sensors_connect_to_command_images_and_each_other(post_world, monkeypatc
     simulator.AdvanceTo(0.3)
     root = simulator.get_context()
     assert diagram.GetOutputPort("echo_sum").Eval(root)[0] == np.inf  # no ground in this hall
-    force = diagram.GetOutputPort("imu_accelerometer").Eval(root)
-    assert 5.0 < force[2] < 25.0
+    assert 5.0 < diagram.GetOutputPort("imu_accelerometer").Eval(root)[2] < 25.0
 
 
-def test_image_time_of_a_late_policy_camera_is_that_of_the_capture(post_world):
-    noise = ObservationNoise(latency=0.2)
-    scenario = Scenario(policy=policy_named("reactive"), observation=noise)
-    diagram = BuildFlightDiagram(scenario, post_world, camera=False)
-    simulator = make_flight_simulator(diagram)
-    simulator.AdvanceTo(0.4)
-    camera = diagram.GetSubsystemByName("policy_camera")
-    context = camera.GetMyContextFromRoot(simulator.get_context())
-    assert camera.image_time_output_port().Eval(context)[0] == pytest.approx(0.2)
-
-
-def test_output_delay_delays_the_camera(post_world):
-    overrides = ["camera.output_delay=0.1", "camera.width=8", "camera.height=6"]
+@pytest.mark.parametrize(
+    ("name", "override"),
+    [("policy_camera", "observation.latency=0.1"), ("camera", "camera.output_delay=0.1")],
+)
+def test_late_cameras_see_from_where_the_vehicle_was(post_world, name, override):
+    overrides = [override, "camera.width=8", "camera.height=6", "policy=!ReactiveConfig {}"]
     diagram = BuildFlightDiagram(load_config(Scenario(), overrides=overrides), post_world)
     simulator = make_flight_simulator(diagram)
     simulator.AdvanceTo(0.4)
-    before = diagram.GetOutputPort("state").Eval(simulator.get_context())[:3]
+    before = np.array(diagram.GetOutputPort("state").Eval(simulator.get_context())[:3])
     simulator.AdvanceTo(0.5)
-    camera = diagram.GetSubsystemByName("camera")
+    camera = diagram.GetSubsystemByName(name)
     context = camera.GetMyContextFromRoot(simulator.get_context())
     assert camera.image_time_output_port().Eval(context)[0] == pytest.approx(0.4)
     X_WB = camera.body_pose_in_world_output_port().Eval(context)
@@ -369,22 +354,18 @@ def test_live_controls_drag_the_goal_and_push_the_vehicle_of_a_flight(post_world
 
 def test_flights_share_a_scene_graph(post_world):
     builder = DiagramBuilder()
-    scene_graph = builder.AddSystem(SceneGraph())
-    systems = {"camera": False, "scene_graph": scene_graph}
+    scene_graph, frames = builder.AddSystem(SceneGraph()), {}
     starts = {"flight": [1.0, 0, 2], "other": [1.0, 2, 2]}
-    flights = {
-        name: AddFlight(
-            builder, Scenario(start=start, start_radius=0.0), post_world, name=name, **systems
-        )
-        for name, start in starts.items()
-    }
+    for name, start in starts.items():
+        scenario = Scenario(start=start, start_radius=0.0, policy=policy_named("straight"))
+        options = {"name": name, "camera": False, "scene_graph": scene_graph}
+        frames[name] = AddFlight(builder, scenario, post_world, **options).geometry.get_frame_id()
     diagram = builder.Build()
     assert scene_graph.HasRenderer("splats")
     context = scene_graph.GetMyContextFromRoot(diagram.CreateDefaultContext())
     query = scene_graph.get_query_output_port().Eval(context)
     for name, start in starts.items():
-        frame = flights[name].geometry.get_frame_id()
-        np.testing.assert_allclose(query.GetPoseInWorld(frame).translation(), start)
+        np.testing.assert_allclose(query.GetPoseInWorld(frames[name]).translation(), start)
 
 
 @pytest.mark.parametrize("name", ["planner", "straight"])
@@ -416,11 +397,9 @@ def test_a_privileged_flight_has_the_derivatives_of_differences(post_world, name
 
 def test_wind_and_thrust_move_the_vehicle_and_its_radius_decides_collisions(post_world):
     def state(**fields):
-        scenario = Scenario(policy=policy_named("straight"), start_radius=0.0, **fields)
-        diagram = BuildFlightDiagram(scenario, post_world, camera=False)
-        simulator = make_flight_simulator(diagram)
-        simulator.AdvanceTo(0.5)
-        return diagram.GetOutputPort("state").Eval(simulator.get_context()).copy()
+        policy = policy_named("straight")
+        scenario = Scenario(timeout=0.5, policy=policy, start_radius=0.0, **fields)
+        return flown(scenario, post_world).states[-1]
 
     calm = state()
     np.testing.assert_array_equal(calm, state(wind=Wind()))
@@ -430,10 +409,8 @@ def test_wind_and_thrust_move_the_vehicle_and_its_radius_decides_collisions(post
     assert np.abs(gusty[0] - gusty[2])[3:6].max() > 0.05
     weak = Kingfisher(thrust_scale=Uniform(min=0.8, max=0.9))
     assert state(vehicle=weak)[2] < state(vehicle=Kingfisher())[2]
-    clearances = []
-    for radius in (0.1, 0.3):
-        scenario = Scenario(policy=policy_named("straight"), vehicle=QuadrotorParams(radius=radius))
-        diagram = BuildFlightDiagram(scenario, post_world, camera=False)
-        clearance = diagram.GetOutputPort("clearance").Eval(diagram.CreateDefaultContext())
-        clearances.append(clearance[0])
-    assert clearances[0] - clearances[1] == pytest.approx(0.2)
+    slim, wide = (
+        flown(Scenario(timeout=0.1, vehicle=QuadrotorParams(radius=radius)), post_world)
+        for radius in (0.1, 0.3)
+    )
+    assert slim.clearances[0] - wide.clearances[0] == pytest.approx(0.2)

@@ -18,12 +18,10 @@ from splatpilot.systems.policies.depthnav import DEPTHNAV_NETWORK, DepthNavConfi
     ("name", "outcome"), [("straight", Outcome.COLLISION), ("reactive", Outcome.GOAL)]
 )
 def test_policies_fly_toward_a_post(name, outcome, post_world):
-    diagram = BuildFlightDiagram(
-        Scenario(policy=policies.policy_named(name)), post_world, camera=False
-    )
+    scenario = Scenario(policy=policies.policy_named(name))
+    diagram = BuildFlightDiagram(scenario, post_world, camera=False)
     flight = fly(diagram)
-    assert flight.outcome == outcome
-    assert flight.hypotheses.shape == (0, 0)
+    assert flight.outcome == outcome and flight.hypotheses.shape == (0, 0)
     assert diagram.HasSubsystemNamed("policy_camera") == (name == "reactive")
     assert not diagram.HasSubsystemNamed("camera")
 
@@ -42,11 +40,9 @@ def test_the_scenario_camera_changes_no_flight(post_world):
 def test_name_gives_a_policy_of_that_speed(name, post_world):
     reach = []
     for speed in (1.5, 3.0):
-        scenario = Scenario(
-            timeout=1.5, start_radius=0.0, policy=policies.policy_named(name, speed)
-        )
-        diagram = BuildFlightDiagram(scenario, post_world, camera=False)
-        states = fly(diagram).states
+        policy = policies.policy_named(name, speed)
+        scenario = Scenario(timeout=1.5, start_radius=0.0, policy=policy)
+        states = fly(BuildFlightDiagram(scenario, post_world, camera=False)).states
         assert np.linalg.norm(states[:, 3:6], axis=1).max() < 1.3 * speed
         reach.append(np.linalg.norm(states[-1, :3] - states[0, :3]))
     assert reach[1] > 1.2 * reach[0] > 0.5

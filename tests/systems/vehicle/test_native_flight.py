@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -24,6 +22,7 @@ from splatpilot.systems.policies.velocity import (
 from splatpilot.systems.vehicle.flatness import (
     FlatnessControllerConfig,
     flatness_command,
+    native_control,
     reaching_acceleration,
 )
 from splatpilot.systems.vehicle.quadrotor import (
@@ -31,6 +30,7 @@ from splatpilot.systems.vehicle.quadrotor import (
     actuated_derivatives,
     component_derivatives,
     limit_command,
+    native_vehicle,
 )
 
 LOWER, UPPER = np.array([0.0, -4.0, 0.0]), np.array([9.0, 4.0, 3.0])
@@ -74,14 +74,8 @@ def test_distances_are_those_of_the_field(kind):
         states = np.random.default_rng(0).integers(3, size=grid.shape).astype(np.uint8)
         outside = kind == "occupied outside"
         field = Esdf(grid.distances, states, grid.lower_W, grid.voxel_size, outside)
-        number = worlds.add_grid(
-            distances=field.distances,
-            states=field.states,
-            lower_W=field.lower_W,
-            upper_W=field.upper_W,
-            voxel_size=field.voxel_size,
-            occupied_outside=outside,
-        )
+        names = ("distances", "states", "lower_W", "upper_W", "voxel_size", "occupied_outside")
+        number = worlds.add_grid(**{name: getattr(field, name) for name in names})
     points = np.random.default_rng(1).uniform(field.lower_W - 1, field.upper_W + 1, (2000, 3))
     points[:3] = field.lower_W, field.upper_W, [np.nan] * 3
     distances, gradients = np.empty(2000), np.empty((2000, 3))
@@ -107,25 +101,10 @@ def test_derivatives_are_those_of_the_formula():
 
 def parameters(vehicle: QuadrotorParams) -> np.ndarray:
     """Returns the numbers of `FLIGHT_PARAMETERS`."""
-    motor, tilt = vehicle.motor_time_constant, vehicle.rate_time_constant
-    values = {
-        "rate_gain": 1 / tilt,
-        "yaw_rate_gain": 1 / (tilt * vehicle.yaw_time_ratio),
-        "motor_gain": 1 / motor if motor else 0.0,
-        "control_min": CONTROL.min_thrust,
-        "control_max": CONTROL.max_thrust,
-        "control_tilt": CONTROL.max_tilt_rate,
-        "control_yaw": CONTROL.max_yaw_rate,
-        "max_tilt_tangent": math.tan(CONTROL.max_tilt),
-        "response_time": RESPONSE_TIME,
-        "max_acceleration": MAX_ACCELERATION,
-    }
-    for k, axis in enumerate("xyz"):
-        values[f"rotor_drag_{axis}"] = vehicle.rotor_drag[k]
-        values[f"quadratic_{axis}"] = vehicle.quadratic_drag[k]
-        values[f"wind_{axis}"] = WIND[k] if vehicle is LAGGING else 0.0
-    known = vars(CONTROL) | vars(vehicle) | values
-    return np.array([known[name] for name in _native.FLIGHT_PARAMETERS], float)
+    wind = WIND if vehicle is LAGGING else [0.0] * 3
+    known = native_vehicle(vehicle, wind) | native_control(CONTROL, vehicle)
+    known |= {"response_time": RESPONSE_TIME, "max_acceleration": MAX_ACCELERATION}
+    return np.array([known[name] for name in _native.FLIGHT_PARAMETERS])
 
 
 def some_states(count: int) -> np.ndarray:
