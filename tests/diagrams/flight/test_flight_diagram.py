@@ -171,22 +171,23 @@ def test_a_decision_can_be_an_input_of_the_diagram(post_world, decision):
 
 
 def test_inputs_of_given_systems_are_connected_or_exported(post_world):
-    start = sample_initial_state(Scenario(), post_world)
-    plants = [QuadrotorPlant(None, start) for _ in range(2)]
-    for plant in plants:
-        plant.DeclareVectorInputPort("gust", 3)
+    class Windy(QuadrotorPlant):
+        def __init__(self):
+            super().__init__(None, sample_initial_state(Scenario(), post_world))
+            self.DeclareVectorInputPort("gust", 3)
+
     controller = block(
         {"state": 13, "acceleration": 3, "goal": 3},
         command=(4, lambda read, time: [9.81 + read("goal")[2], 0, 0, 0]),
     )
-    systems = {"policy": block(acceleration=3), "controller": controller, "plant": plants[0]}
+    systems = {"policy": block(acceleration=3), "controller": controller, "plant": Windy()}
     diagram = BuildFlightDiagram(Scenario(), post_world, camera=False, **systems)
     assert diagram.HasInputPort("plant_gust") and not diagram.HasInputPort("controller_goal")
     command = diagram.GetOutputPort("command").Eval(diagram.CreateDefaultContext())
     assert command[0] == pytest.approx(9.81 + post_world.p_WG[2])
 
     builder = DiagramBuilder()
-    plant = builder.AddNamedSystem("mine", plants[1])
+    plant = builder.AddNamedSystem("mine", Windy())
     gust = builder.AddSystem(ConstantVectorSource(np.ones(3)))
     builder.Connect(gust.get_output_port(), plant.GetInputPort("gust"))
     AddFlight(builder, Scenario(), post_world, plant=plant, camera=False)
