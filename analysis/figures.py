@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.training.corpus.corpus import Corpus
-from splatpilot.training.corpus.samples import EXPERT, SOURCES
+from splatpilot.training.corpus.corpus import EXPERT, SOURCES, Corpus
 
 _RED = np.array([0.95, 0.05, 0.05])
 _GRAY = 0.35  # of unknown values

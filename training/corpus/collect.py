@@ -24,18 +24,22 @@ from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 from splatpilot.training.corpus import library
-from splatpilot.training.corpus.corpus import CONFIG, Corpus, CorpusConfig, subfolders, write_ledger
-from splatpilot.training.corpus.expert import PLANNER, Label, Labeler, fly_planner, fly_policy
-from splatpilot.training.corpus.samples import (
+from splatpilot.training.corpus.corpus import (
+    CONFIG,
     EXPERT,
     OFF_PATH,
     RECOVERY,
     SOURCES,
+    Corpus,
+    CorpusConfig,
     OtherVersionError,
     Samples,
     Shard,
+    subfolders,
+    write_ledger,
     write_shard,
 )
+from splatpilot.training.corpus.expert import PLANNER, Label, Labeler, fly_planner, fly_policy
 
 
 class Demonstration(NamedTuple):
@@ -48,8 +52,7 @@ class Demonstration(NamedTuple):
 def keep_clear(labels: Iterable[Label], field: Esdf) -> list[Demonstration]:
     """Drops trajectories in contact, and states without others."""
     kept = []
-    for state, plan in labels:
-        waypoints_W = plan.waypoints_W
+    for state, waypoints_W in ((label.state, label.plan.waypoints_W) for label in labels):
         clear = (field.distance(waypoints_W) > VEHICLE_RADIUS).all(axis=1)  # (K,)
         if clear.any():
             waypoints_W = np.where(clear[:, None, None], waypoints_W, np.nan)
@@ -72,19 +75,15 @@ def render_samples(
     if not demonstrations:
         return samples
     appearance = draw_appearance(rng, config.appearance)
-    camera, optics = (
-        make_onboard_camera(config.camera, with_appearance(world, appearance)),
-        config.camera,
-    )
+    optics = config.camera
+    camera = make_onboard_camera(optics, with_appearance(world, appearance))
     row = 0
     for state, waypoints_W in demonstrations:
         p_WB, v_WB, _, _ = QuadrotorState.of(state)
         X_WB = pose_from_state(state)
         reach = min(bound, float(labeler.field.distance(p_WB)) - VEHICLE_RADIUS)
-        around = [
-            library.perturb_pose(X_WB, config.perturbation, reach, rng) for _ in range(copies)
-        ]
-        for X_WP in [X_WB, *around]:
+        for copy in range(1 + copies):
+            X_WP = library.perturb_pose(X_WB, config.perturbation, reach, rng) if copy else X_WB
             R_PW, p_WP = X_WP.rotation().matrix().T, X_WP.translation()
             view = camera.render(X_WP)
             samples.color[row] = color_pixels(view.color)
@@ -166,7 +165,7 @@ def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str)
 
     def write(kind: int, parts: list[Samples], flights: list[dict]) -> None:
         about = {"world": source.name, "source": kind, "flights": flights, "revision": revision}
-        write_shard(shard_folder(folder, source.name, kind), parts, config.size, **about)
+        write_shard(shard_folder(folder, source.name, kind), parts, config.size, about)
 
     off_path = []
     own_pose = replace(config, perturbation=replace(config.perturbation, copies=0))
@@ -190,8 +189,7 @@ def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str)
         flights = [fly_policy(start, world, config.expert, labeler) for start in starts]
     parts, entries = [], []
     for number, (start, flight, rng) in enumerate(zip(starts, flights, rngs, strict=True)):
-        labels = flight.labels if flight.is_demonstration else []
-        shown = keep_clear(labels, labeler.field)
+        shown = keep_clear(flight.labels if flight.is_demonstration else (), labeler.field)
         parts.append(render_samples(shown, world, labeler, config, bound, rng))
         entries.append(
             {
@@ -239,10 +237,8 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
         name = sources[k].name
         if k in damage:
             say(f"{damage[k]}: {name} is collected again")
-        for path in (
-            out / "worlds" / name,
-            *(shard_folder(out, name, s) for s in (OFF_PATH, EXPERT)),
-        ):
+        folders = [shard_folder(out, name, source) for source in (OFF_PATH, EXPERT)]
+        for path in (out / "worlds" / name, *folders):
             shutil.rmtree(path, ignore_errors=True)
     collect = partial(_collect, out, config, program)
     bar = Progress(total=worlds, initial=worlds - len(missing), desc="collecting", unit="world")

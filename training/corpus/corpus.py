@@ -2,18 +2,25 @@
 
 corpus.yaml      every field of its configuration
 worlds/NAME/     a world: `world.yaml`, `esdf.npz`
-shards/NAME/     samples of one world, see `splatpilot.training.corpus.samples`
+shards/NAME/     samples of one world and source:
+  color.npy      (N, H, W, 3) uint8
+  depth.npy      (N, H, W) float16
+  labels.npy     (N,) records, see `SampleSize.label_type`
+  shard.json     format version, world, source, flights, sizes and checksums
 ledger.csv       sources of all samples, a row for each flight
 """
 
 import csv
+import json
 import os
 import shutil
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -25,16 +32,161 @@ from splatpilot.systems.common.files import (
     written_atomically,
 )
 from splatpilot.systems.common.provenance import first_training_seed
+from splatpilot.systems.common.readers import error_summary
 from splatpilot.systems.common.validation import Config, bounded, require
+from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.expert import ExpertConfig
 from splatpilot.training.corpus.library import WORLD, LibraryConfig, PerturbationConfig, WorldRecord
-from splatpilot.training.corpus.samples import OFF_PATH, SHARD, SOURCES, Samples, SampleSize, Shard
 
-CONFIG = "corpus.yaml"
-LEDGER = "ledger.csv"
+CONFIG, LEDGER, SHARD = "corpus.yaml", "ledger.csv", "shard.json"
+FORMAT_VERSION = 2
 
-_REMEDY = "run `splatpilot corpus make` again"
+# Source of a sample: an expert's flight, the time before a student's near-miss, or free space.
+EXPERT, RECOVERY, OFF_PATH = 0, 1, 2
+SOURCES = {EXPERT: "expert", RECOVERY: "recovery", OFF_PATH: "off_path"}  # names
+
+_ARRAYS = "color", "depth", "labels"
+_RERUN = "run `splatpilot corpus make` again"
+_REMEDY = "delete that folder and run the command that collected it again"
+
+
+class SampleSize(NamedTuple):
+    """Size of a corpus's samples."""
+
+    height: int  # [px]
+    width: int  # [px]
+    trajectories: int  # K
+
+    def image_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Returns the shapes of one sample's images."""
+        return {"color": (self.height, self.width, 3), "depth": (self.height, self.width)}
+
+    def label_type(self) -> np.dtype:
+        """Returns the type of one sample's labels, a record."""
+        trajectories = "trajectories_B", "<f4", (self.trajectories, NUM_WAYPOINTS, 3)
+        return np.dtype([("X_WB", "<f8", 7), ("v_B", "<f4", 3), ("goal_B", "<f4", 3), trajectories])
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """N samples. B is the body (x forward, y left, z up) at the pose of the image."""
+
+    color: np.ndarray  # (N, H, W, 3) uint8
+    depth: np.ndarray  # (N, H, W) float16 [m], planar z; 0: too near, inf: nothing within range
+    X_WB: np.ndarray  # (N, 7) float64, quaternion wxyz and position [m]
+    v_B: np.ndarray  # (N, 3) float32 [m/s]
+    goal_B: np.ndarray  # (N, 3) float32 [m], p_BG_B, from the body to the goal
+    # (N, K, 10, 3) float32 [m], waypoints at 0.1 s to 1.0 s, cheapest first; missing ones are NaN.
+    trajectories_B: np.ndarray
+    world: np.ndarray  # (N,) int32, index into `Corpus.worlds`
+    source: np.ndarray  # (N,) uint8, of `SOURCES`
+
+    @classmethod
+    def zeros(cls, count: int, size: SampleSize) -> Self:
+        """Allocates `count` samples."""
+        labels = np.zeros(count, size.label_type())
+        color, depth = size.image_shapes().values()
+        return cls(
+            np.zeros((count, *color), np.uint8),
+            np.zeros((count, *depth), np.float16),
+            *(labels[name].copy() for name in labels.dtype.names or ()),
+            world=np.zeros(count, np.int32),
+            source=np.zeros(count, np.uint8),
+        )
+
+    def __len__(self) -> int:
+        return len(self.color)
+
+
+def write_shard(
+    path: Path, parts: Sequence[Samples], size: SampleSize, about: dict[str, Any]
+) -> None:
+    """Writes samples to the folder `path` atomically; an existing one stays. `about` has their
+    `world`, `source`, `flights` and `revision`."""
+
+    def joined(name: str) -> np.ndarray:
+        return np.concatenate([getattr(part, name) for part in (Samples.zeros(0, size), *parts)])
+
+    labels = np.empty(sum(map(len, parts)), size.label_type())
+    for name in labels.dtype.names or ():
+        labels[name] = joined(name)
+    with folder_written_atomically(path) as folder:
+        files = {}
+        for name in _ARRAYS:
+            file = folder / f"{name}.npy"
+            np.save(file, labels if name == "labels" else joined(name))
+            files[file.name] = {"bytes": file.stat().st_size, "crc32": _checksum(file)}
+        about = {"format_version": FORMAT_VERSION, "samples": len(labels), "files": files} | about
+        (folder / SHARD).write_text(json.dumps(about, indent=1) + "\n")
+
+
+class OtherVersionError(ValueError):
+    """A shard has a format version that this program does not know."""
+
+
+class Shard:
+    """A shard on disk. Its arrays are mapped into memory and read as they are used."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            about = json.loads((path / SHARD).read_text())
+            version = about["format_version"]
+            if version == FORMAT_VERSION:
+                self._read(about)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            reason = f"missing {error}" if isinstance(error, KeyError) else error_summary(error)
+            raise ValueError(f"{path / SHARD} describes no shard ({reason}); {_REMEDY}") from None
+        if version != FORMAT_VERSION:
+            raise OtherVersionError(
+                f"format version of {path} must be {FORMAT_VERSION}, got {version}; use the "
+                "version of the program that collected it, or collect into another folder"
+            )
+        for name, (size, _) in self._files.items():
+            file = path / name
+            found = file.stat().st_size if file.is_file() else 0
+            require(found == size, f"the size of {file}", f"{size} bytes", found, _REMEDY)
+
+    def _read(self, about: dict[str, Any]) -> None:
+        self.revision: str = about["revision"]
+        self.world: str = about["world"]
+        self.source: int = about["source"]
+        self.flights: list[dict[str, Any]] = about["flights"]
+        self._count: int = about["samples"]
+        files = {f"{name}.npy": about["files"][f"{name}.npy"] for name in _ARRAYS}
+        self._files = {name: (file["bytes"], file["crc32"]) for name, file in files.items()}
+        require(isinstance(self.world, str), "world", "a name", self.world)
+        require(self.source in SOURCES, "source", f"one of {list(SOURCES)}", self.source)
+        valid = isinstance(self._count, int) and self._count >= 0
+        require(valid, "samples", "at least 0", self._count)
+        states = [flight.get("states", 0) for flight in self.flights]
+        require(all(isinstance(n, int) for n in states), "states", "whole numbers", states)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def verify(self) -> None:
+        """Reads everything; raises ValueError for content that has changed since."""
+        for name, (_, checksum) in self._files.items():
+            if _checksum(self.path / name) != checksum:
+                raise ValueError(f"{self.path / name} is damaged (wrong checksum); {_REMEDY}")
+        for name, array in self.arrays.items():
+            what = f"samples in {self.path / SHARD}"
+            require(len(array) == len(self), what, f"{len(array)} as in {name}", len(self), _REMEDY)
+
+    @cached_property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The fields of `Samples` but `world` and `source`, read-only."""
+        if not self._count:  # Empty files cannot be mapped.
+            return {}
+        color, depth, labels = (np.load(self.path / file, mmap_mode="r") for file in self._files)
+        fields = {name: labels[name] for name in labels.dtype.names or ()}
+        return {"color": color, "depth": depth} | fields
+
+
+def _checksum(file: Path) -> int:
+    return zlib.crc32(np.memmap(file, np.uint8, mode="r"))
 
 
 @dataclass
@@ -78,7 +230,7 @@ class Corpus:
         index = {world.name: k for k, world in enumerate(self.worlds)}
         _require_all(folder / "worlds", {shard.world for shard in self.shards}, index)
         self._filled = [shard for shard in self.shards if len(shard)]
-        require(self._filled, f"{folder}", "a corpus with samples", "none", _REMEDY)
+        require(self._filled, f"{folder}", "a corpus with samples", "none", _RERUN)
         self._world = [index[shard.world] for shard in self._filled]
         self._first = np.cumsum([0, *map(len, self._filled)])
 
@@ -97,12 +249,10 @@ class Corpus:
 
     def verify(self) -> None:
         """Reads everything; raises an error for content that has changed since."""
-        types = self.config.size.image_types()
         for shard in self.shards:
             shard.verify()
-            for name in types if len(shard) else ():
-                size, given = types[name].shape, shard.arrays[name].shape[1:]
-                what = f"images of {shard.path}"
+            for name, size in self.config.size.image_shapes().items() if len(shard) else ():
+                given, what = shard.arrays[name].shape[1:], f"images of {shard.path}"
                 require(given == size, what, f"{size} as in {self.folder / CONFIG}", given)
         for world in self.worlds:
             _ = world.esdf
@@ -115,7 +265,7 @@ class Corpus:
     def samples(self, indices: np.ndarray) -> Samples:
         """Copies samples (N,), in the order of `indices`."""
         indices = np.asarray(indices)
-        if len(indices) and not (indices.min() >= 0 and indices.max() < len(self)):
+        if ((indices < 0) | (indices >= len(self))).any():
             raise IndexError(f"indices of samples must be in [0, {len(self)})")
         found = Samples.zeros(len(indices), self.config.size)
         within = np.searchsorted(self._first, indices, side="right") - 1
@@ -123,15 +273,14 @@ class Corpus:
             chosen = np.flatnonzero(within == k)
             for name, array in self._filled[k].arrays.items():
                 getattr(found, name)[chosen] = array[indices[chosen] - self._first[k]]
-            found.world[chosen] = self._world[k]
-            found.source[chosen] = self._filled[k].source
+            found.world[chosen], found.source[chosen] = self._world[k], self._filled[k].source
         return found
 
 
-def _require_all(folder: Path, needed: set[str], present: Any) -> None:
+def _require_all(folder: Path, needed: set[str], present: Iterable[str]) -> None:
     if missing := sorted(needed.difference(present)):
         raise ValueError(
-            f"No such folder: {folder / missing[0]}, which {LEDGER} or shards name; {_REMEDY}"
+            f"No such folder: {folder / missing[0]}, which {LEDGER} or shards name; {_RERUN}"
         )
 
 
@@ -143,7 +292,7 @@ def subfolders(folder: Path) -> list[Path]:
 def distinct_worlds(corpora: Sequence[Corpus]) -> dict[str, WorldRecord]:
     """Returns the worlds of corpora by name, each once."""
     records: dict[str, WorldRecord] = {}
-    for world in chain.from_iterable(corpus.worlds for corpus in corpora):
+    for world in chain(*(corpus.worlds for corpus in corpora)):
         first = records.setdefault(world.name, world)
         if not first.has_same_distances(world):
             raise ValueError(
@@ -156,29 +305,20 @@ def distinct_worlds(corpora: Sequence[Corpus]) -> dict[str, WorldRecord]:
 def distinct_shards(corpora: Sequence[Corpus]) -> list[list[Shard]]:
     """Lists the shards of each corpus that are not in those before it. Shards are equal if their
     names and descriptions are, which have checksums of all files."""
-    seen: set[tuple[str, bytes]] = set()
-    kept: list[list[Shard]] = []
-    for corpus in corpora:
-        kept.append([])
-        for shard in corpus.shards:
-            key = shard.path.name, (shard.path / SHARD).read_bytes()
-            if key not in seen:
-                seen.add(key)
-                kept[-1].append(shard)
-    return kept
+    seen: dict[tuple[str, bytes], Shard] = {}
+
+    def is_first(shard: Shard) -> bool:
+        return seen.setdefault((shard.path.name, (shard.path / SHARD).read_bytes()), shard) is shard
+
+    return [list(filter(is_first, corpus.shards)) for corpus in corpora]
 
 
 def write_ledger(corpus: Corpus) -> None:
     """Writes `ledger.csv` from the descriptions of the shards."""
-    rows: list[dict[str, Any]] = []
+    rows = []
     for shard in corpus.shards:
-        same = {
-            "shard": shard.path.name,
-            "world": shard.world,
-            "source": SOURCES[shard.source],
-            "revision": shard.revision,
-        }
-        rows += [same | flight for flight in shard.flights]
+        same = {"shard": shard.path.name, "world": shard.world, "source": SOURCES[shard.source]}
+        rows += [same | {"revision": shard.revision} | flight for flight in shard.flights]
     write_csv(corpus.folder / LEDGER, rows)
 
 

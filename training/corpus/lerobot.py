@@ -23,8 +23,7 @@ from splatpilot.systems.common.files import folder_written_atomically
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
-from splatpilot.training.corpus.corpus import Corpus
-from splatpilot.training.corpus.samples import EXPERT, Shard
+from splatpilot.training.corpus.corpus import EXPERT, Corpus, Shard
 
 COLOR, DEPTH = "observation.images.color", "observation.images.depth"
 TASK = "fly to the goal"

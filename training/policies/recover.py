@@ -5,13 +5,12 @@ worlds; the second stage trains on all samples. Another policy may fly instead o
 `diffaero_rgb` learns from the same corpora.
 """
 
-import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from hashlib import blake2b
+from hashlib import blake2b, sha256
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -39,23 +38,25 @@ from splatpilot.systems.policies.diffaero_rgb import DiffAeroRgbConfig
 from splatpilot.systems.policies.student import StudentConfig
 from splatpilot.training.corpus.collect import keep_clear, render_samples
 from splatpilot.training.corpus.corpus import (
+    EXPERT,
+    RECOVERY,
     Corpus,
     CorpusConfig,
+    Shard,
     distinct_shards,
     distinct_worlds,
     link_corpus,
     write_ledger,
+    write_shard,
 )
 from splatpilot.training.corpus.expert import Labeler
 from splatpilot.training.corpus.library import WorldRecord
-from splatpilot.training.corpus.samples import EXPERT, RECOVERY, Shard, write_shard
 from splatpilot.training.policies import train
 from splatpilot.training.policies.student_data import held_out_worlds
 from splatpilot.training.policies.trainer import CorpusTraining, Trainer
 
 _PATIENCE = 2.0  # maximum time of a student's flight, in times of the expert's
 _ARRAYS = "p_WG", "times", "states", "clearances"  # of a `StudentFlight`, in a file of flights
-
 
 NEAR = 1.2  # [m] clearance from obstacles, below which a minimum is a near-miss
 BEFORE = 0.5, 2.5  # [s] before a near-miss, range of the labeled states
@@ -86,8 +87,8 @@ class StudentFlight:
     def digest(self) -> str:
         """Computes a digest of its content."""
         arrays = self.p_WG, self.times, self.states
-        content = b"".join(np.ascontiguousarray(array, float).tobytes() for array in arrays)
-        return hashlib.sha256(content).hexdigest()[:16]
+        content = b"".join(np.asarray(array, float).tobytes() for array in arrays)
+        return sha256(content).hexdigest()[:16]
 
 
 def obstacle_clearances(flight: StudentFlight, field: DistanceField) -> np.ndarray:
@@ -111,22 +112,15 @@ def near_misses(times: np.ndarray, clearances: np.ndarray) -> np.ndarray:
     return times[peaks - 1]
 
 
-def rows_before(times: np.ndarray, events: np.ndarray, period: float) -> np.ndarray:
-    """Returns the indices (n,) of samples `BEFORE` events (m,) [s], every `period` [s]."""
-    ahead = np.arange(BEFORE[0], BEFORE[1] + 1e-9, period)
-    desired = (events[:, None] - ahead).ravel()
-    desired = desired[desired >= times[0] - 1e-9]
-    return np.unique(np.searchsorted(times, desired - 1e-9))
-
-
 def rows_to_recover(flight: StudentFlight, events: np.ndarray, period: float) -> np.ndarray:
-    """Returns the indices (n,) of the samples to label, none in contact: before the near-misses
+    """Returns the indices (n,) of the samples to label, none in contact: `BEFORE` the near-misses
     `events` (m,) [s], every `period` [s], and all along if the flight did not arrive."""
     times = flight.times
-    rows = rows_before(times, events, period)
+    labeled = (events[:, None] - np.arange(BEFORE[0], BEFORE[1] + 1e-9, period)).ravel()
+    labeled = labeled[labeled >= times[0] - 1e-9]
     if not flight.arrived:
-        along = np.arange(times[0], times[-1], FAILED_PERIOD)
-        rows = np.union1d(rows, np.searchsorted(times, along - 1e-9))
+        labeled = np.append(labeled, np.arange(times[0], times[-1], FAILED_PERIOD))
+    rows = np.unique(np.searchsorted(times, labeled - 1e-9))
     return rows[flight.clearances[rows] > 0.0]
 
 
@@ -144,7 +138,7 @@ def add_recovery(folder: Path, flights: Sequence[StudentFlight], jobs: int | Non
         by_world.setdefault(flight.world, []).append(flight)
     work = []
     for world, flown in by_world.items():
-        digest = hashlib.sha256("".join(f.digest() for f in flown).encode()).hexdigest()[:12]
+        digest = sha256("".join(f.digest() for f in flown).encode()).hexdigest()[:12]
         path = folder / "shards" / f"recovery-{world}-{digest}"
         if not path.exists():
             work.append((path, records[world], flown))
@@ -188,31 +182,23 @@ def _add_world(
             }
         )
     about = {"world": record.name, "source": RECOVERY, "flights": entries, "revision": revision}
-    write_shard(path, parts, config.size, **about)
+    write_shard(path, parts, config.size, about)
 
 
-@dataclass(frozen=True)
-class Task:
-    """A path that the expert flew."""
-
-    start: list[float]  # [m]
-    goal: list[float]  # [m]
-    timeout: float  # [s]
-
-
-def list_tasks(shards: Sequence[Shard], flights: int) -> dict[str, list[Task]]:
-    """Lists, by world, the expert's first `flights` in shards."""
-    tasks: dict[str, list[Task]] = {}
+def list_tasks(shards: Sequence[Shard], flights: int) -> dict[str, list[dict[str, Any]]]:
+    """Lists, by world, the expert's first `flights` in shards, as fields of `Scenario`."""
+    tasks: dict[str, list[dict[str, Any]]] = {}
     for shard in shards:
         for flight in shard.flights if shard.source == EXPERT else ():
             if flight["states"]:
-                task = Task(flight["start"], flight["goal"], _PATIENCE * flight["time_s"])
+                task = {"start": flight["start"], "goal": flight["goal"]}
+                task["timeout"] = _PATIENCE * flight["time_s"]
                 tasks.setdefault(shard.world, []).append(task)
     return {world: paths[:flights] for world, paths in tasks.items()}
 
 
 def fly_worlds(
-    corpus: Corpus, tasks: dict[str, list[Task]], policy: str, folder: Path, jobs: int
+    corpus: Corpus, tasks: dict[str, list[dict[str, Any]]], policy: str, folder: Path, jobs: int
 ) -> tuple[list[StudentFlight], Counter[str]]:
     """Flies a policy, or a file of weights, in worlds of a corpus; returns flights and counts of
     their outcomes."""
@@ -254,30 +240,24 @@ def _is_intact(file: Path) -> bool:
     return True
 
 
-def _fly_world(name: str, config: CorpusConfig, work: tuple[WorldRecord, list[Task], Path]) -> None:
+def _fly_world(
+    name: str, config: CorpusConfig, work: tuple[WorldRecord, list[dict[str, Any]], Path]
+) -> None:
     """Flies the tasks of one world at the expert's speed, and writes the flights to a file."""
     record, tasks, file = work
     policy: Any = policy_named(name, config.expert.speed)
-    world = record.make()
+    world, source = record.make(), record.source
     if isinstance(policy, StudentConfig | DiffAeroRgbConfig):
         policy = replace(policy, camera=config.camera)
     arrays: dict[str, Any] = {}
     outcomes = []
+    fields = {"seed": source.seed, "world": source.world, "start_radius": 0.0, "policy": policy}
     for task in tasks:
-        scenario = Scenario(
-            seed=record.source.seed,
-            world=record.source.world,
-            start=task.start,
-            goal=task.goal,
-            start_radius=0.0,
-            timeout=task.timeout,
-            policy=policy,
-        )
         try:
-            flight = fly(BuildFlightDiagram(scenario, world, camera=False))
+            flight = fly(BuildFlightDiagram(Scenario(**fields, **task), world, camera=False))
         except InfeasibleFlightError:
             continue
-        parts = np.array(task.goal), flight.times, flight.states, flight.clearances
+        parts = np.array(task["goal"]), flight.times, flight.states, flight.clearances
         for name, array in zip(_ARRAYS, parts, strict=True):
             arrays[f"{name}_{len(outcomes)}"] = array
         outcomes.append(str(flight.outcome))

@@ -19,9 +19,15 @@ from splatpilot.systems.common.readers import error_summary
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.student import encode_color, encode_depth
 from splatpilot.systems.vehicle.state import rotation_matrices
-from splatpilot.training.corpus.corpus import Corpus, distinct_shards, distinct_worlds
+from splatpilot.training.corpus.corpus import (
+    RECOVERY,
+    SHARD,
+    Corpus,
+    Shard,
+    distinct_shards,
+    distinct_worlds,
+)
 from splatpilot.training.corpus.library import WorldRecord, require_untested
-from splatpilot.training.corpus.samples import RECOVERY, SHARD, Shard
 from splatpilot.training.policies.networks import StudentModule
 from splatpilot.training.policies.ray_casting import EsdfGeometry
 from splatpilot.training.policies.trainer import Trainer

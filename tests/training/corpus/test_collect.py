@@ -25,10 +25,9 @@ from splatpilot.training.corpus.collect import (
     keep_clear,
     render_samples,
 )
-from splatpilot.training.corpus.corpus import CorpusConfig
+from splatpilot.training.corpus.corpus import EXPERT, OFF_PATH, CorpusConfig
 from splatpilot.training.corpus.expert import ExpertConfig, Label, Labeler
 from splatpilot.training.corpus.library import PerturbationConfig
-from splatpilot.training.corpus.samples import EXPERT, OFF_PATH
 
 
 def all_bytes(folder: Path) -> dict[str, bytes]:

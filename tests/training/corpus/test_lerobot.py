@@ -8,9 +8,8 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from splatpilot.training.corpus.corpus import Corpus, write_ledger
+from splatpilot.training.corpus.corpus import Corpus, Samples, write_ledger, write_shard
 from splatpilot.training.corpus.lerobot import COLOR, DEPTH, TASK, export
-from splatpilot.training.corpus.samples import Samples, write_shard
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +90,7 @@ def test_a_flight_is_split_where_a_state_is_missing(collected, tmp_path):
     flights = [flight | {"states": flight["states"]} for flight in shard.flights]
     flights[0]["states"] -= 1
     about = {"world": shard.world, "source": shard.source, "flights": flights, "revision": ""}
-    write_shard(folder / "shards/a", [Samples(**parts)], collected.config.size, **about)
+    write_shard(folder / "shards/a", [Samples(**parts)], collected.config.size, about)
     write_ledger(Corpus(folder))
     assert "3 episodes" in export(Corpus(folder), tmp_path / "out")
     episodes = pq.read_table(tmp_path / "out/meta/episodes/chunk-000/file-000.parquet")

@@ -7,13 +7,12 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder, HalfSpace
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
-from splatpilot.training.corpus.samples import EXPERT, RECOVERY
+from splatpilot.training.corpus.corpus import EXPERT, RECOVERY
 from splatpilot.training.policies.recover import (
     StudentFlight,
     add_recovery,
     near_misses,
     obstacle_clearances,
-    rows_before,
     rows_to_recover,
 )
 
@@ -55,30 +54,36 @@ def test_ground_and_ceiling_are_no_obstacles():
     np.testing.assert_array_equal(obstacle_clearances(flight, field), expected)
 
 
-def test_states_are_labeled_before_near_misses():
-    rows = rows_before(TIMES, np.array([2.0, 8.0]), 0.4)
-    expected = [0.3, 0.7, 1.1, 1.5, 5.5, 5.9, 6.3, 6.7, 7.1, 7.5]
-    np.testing.assert_allclose(TIMES[rows], expected, atol=0.02 + 1e-9)
-    assert len(rows_before(TIMES, np.array([0.3]), 0.4)) == 0
-    assert len(rows_before(TIMES, np.array([8.0, 8.4]), 0.4)) == 7
+def labeled_times(end: float, clear: np.ndarray, *events: float) -> np.ndarray:
+    """The times [s] of labeled states of a flight to x = `end` [m]; its goal is at x = 10 m."""
+    p_WB = np.linspace([0.0, 0.0, 1.5], [end, 0.0, 1.5], len(TIMES))
+    states = np.stack([hover_state(p) for p in p_WB])
+    flight = StudentFlight("W", np.array([10.0, 0.0, 1.5]), TIMES, states, clear)
+    return TIMES[rows_to_recover(flight, np.array(events), 0.4)]
 
 
-def test_flights_that_do_not_arrive_are_labeled_all_along():
-    def rows(end: float, clear: np.ndarray) -> list[float]:
-        p_WB = np.linspace([0.0, 0.0, 1.5], [end, 0.0, 1.5], len(TIMES))
-        states = np.stack([hover_state(p) for p in p_WB])
-        flight = StudentFlight("W", np.array([10.0, 0.0, 1.5]), TIMES, states, clear)
-        return TIMES[rows_to_recover(flight, near_misses(TIMES, clear), 0.4)].tolist()
+NEAR = [1.5, 1.9, 2.3, 2.7, 3.1, 3.5]
+ALONG = np.arange(0.0, 11.9, 0.8)
 
-    near = [1.5, 1.9, 2.3, 2.7, 3.1, 3.5]
-    along = np.arange(0.0, 11.9, 0.8)
-    assert rows(9.71, clearances()) == []
-    np.testing.assert_allclose(rows(9.71, clearances((4.0, 0.5))), near, atol=0.021)
-    np.testing.assert_allclose(rows(9.69, clearances()), along, atol=0.021)
-    both = np.union1d(along, near)
-    np.testing.assert_allclose(rows(3.0, clearances((4.0, 0.5))), both, atol=0.021)
-    inside = clearances() - 4.0 * (TIMES > 5.0)
-    assert max(rows(3.0, inside)) <= 5.0
+
+@pytest.mark.parametrize(
+    ("end", "events", "expected"),
+    [
+        (9.71, [], []),
+        (9.71, [4.0], NEAR),
+        (9.71, [2.0, 8.0], [0.3, 0.7, 1.1, 1.5, 5.5, 5.9, 6.3, 6.7, 7.1, 7.5]),
+        (9.71, [0.3], []),
+        (9.71, [8.0, 8.4], [5.5, 5.9, 6.3, 6.7, 7.1, 7.5, 7.9]),
+        (9.69, [], ALONG),
+        (3.0, [4.0], np.union1d(ALONG, NEAR)),
+    ],
+)
+def test_states_are_labeled_before_near_misses_and_all_along_failed_flights(end, events, expected):
+    np.testing.assert_allclose(labeled_times(end, clearances(), *events), expected, atol=0.021)
+
+
+def test_states_in_contact_are_not_labeled():
+    assert labeled_times(3.0, clearances() - 4.0 * (TIMES > 5.0), 6.0).max() <= 5.0
 
 
 def straight_flight(record) -> StudentFlight:

@@ -10,10 +10,9 @@ from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder,
 from splatpilot.systems.common.files import claim_folder
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.collect import shard_folder
-from splatpilot.training.corpus.corpus import CONFIG, CorpusConfig
+from splatpilot.training.corpus.corpus import CONFIG, EXPERT, CorpusConfig, Samples, write_shard
 from splatpilot.training.corpus.expert import Labeler
 from splatpilot.training.corpus.library import WorldSource, record_world
-from splatpilot.training.corpus.samples import EXPERT, Samples, write_shard
 from splatpilot.training.policies.evaluation import CAMERA_AHEAD
 from splatpilot.training.policies.ray_casting import PixelRays, ShapeGeometry
 
@@ -74,5 +73,5 @@ def _write_corpus(folder: Path, worlds: int, states: int, camera: OnboardCamera)
             samples.trajectories_B[n] = label.waypoints_B
             n += 1
         about = {"world": source.name, "source": EXPERT, "flights": [], "revision": ""}
-        write_shard(shard_folder(folder, source.name), [samples], config.size, **about)
+        write_shard(shard_folder(folder, source.name), [samples], config.size, about)
     return folder

@@ -11,10 +11,9 @@ from splatpilot.systems.common.config import load_config
 from splatpilot.systems.policies.checkpoint import checkpoint_policy
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus import collect
-from splatpilot.training.corpus.corpus import Corpus, CorpusConfig
+from splatpilot.training.corpus.corpus import EXPERT, RECOVERY, Corpus, CorpusConfig
 from splatpilot.training.corpus.expert import ExpertConfig
 from splatpilot.training.corpus.library import LibraryConfig
-from splatpilot.training.corpus.samples import EXPERT, RECOVERY
 from splatpilot.training.policies import recover as recovery
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
