@@ -1,10 +1,10 @@
 import numpy as np
 
 from splatpilot.systems.policies import agile_autonomy
-from splatpilot.systems.policies.base import Observation
+from splatpilot.systems.policies.base import observation
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.vehicle.quadrotor import hover_state
-from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
+from splatpilot.systems.vehicle.state import pose_from_state
 
 X = hover_state([0, 0, 2])
 PATH = np.linspace(0.1, 1.0, 10)[:, None]
@@ -28,7 +28,6 @@ def test_progress_reduces_costs():
         ahead = PATH * [1, 0, 0]
         return np.stack([0.2 * ahead, ahead, -ahead]), np.full(3, 0.3)
 
-    depth, p_WG = np.full((24, 32), 9.0), np.array([9, 0, 2])
-    seen = Observation(0.0, pose_from_state(X), QuadrotorState.of(X), p_WG, depth)
+    seen = observation(0.0, X, np.array([9, 0, 2]), np.full((24, 32), 9.0))
     plan = agile_autonomy.plan(network, seen, 2.0, None)
     np.testing.assert_allclose(plan.costs, [0.28, 0.2, 0.4])

@@ -5,7 +5,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
-from splatpilot.systems.policies.base import Observation, inverse_depth, pool_depth, target_velocity
+from splatpilot.systems.policies.base import inverse_depth, observation, pool_depth, target_velocity
 from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
 from splatpilot.systems.policies.diffaero import (
     DiffAero,
@@ -19,7 +19,6 @@ from splatpilot.systems.policies.straight import Straight, StraightConfig
 from splatpilot.systems.policies.student import Student, StudentDepthConfig, StudentRgbConfig
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import hover_state
-from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 
 P_WG = np.array([12.0, 3.0, 2.0])
 POLICIES = [
@@ -67,8 +66,8 @@ def test_policy_decides_at_its_rate(make, configure, image):
     initial = context.get_discrete_state()
     groups = [np.array(initial.value(i)) for i in range(initial.num_groups())]
     for time in (0.0, 1.0 / config.rate):
-        seen = Observation(time, pose_from_state(x), QuadrotorState.of(x), P_WG, pixels)
-        groups = [np.asarray(group, float) for group in system.decide(seen, *groups)]
+        decided = system.decide(observation(time, x, P_WG, pixels), *groups)
+        groups = [np.asarray(group, float) for group in decided]
     simulator.Initialize()
     simulator.AdvanceTo(1.5 / config.rate)
     for i in range(system.num_output_ports()):

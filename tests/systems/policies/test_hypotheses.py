@@ -10,6 +10,7 @@ from splatpilot.systems.policies.hypotheses import (
     num_hypotheses_in,
 )
 from splatpilot.systems.vehicle.quadrotor import hover_state
+from tests.systems.vehicle.responses import evaluate
 
 
 def some_hypotheses(count=3):
@@ -66,11 +67,7 @@ def test_invalid_shapes_are_refused():
 
 
 def waypoint(selector, vector, time):
-    context = selector.CreateDefaultContext()
-    context.SetTime(time)
-    selector.GetInputPort("hypotheses").FixValue(context, vector)
-    selector.GetInputPort("state").FixValue(context, hover_state([7.0, 8.0, 9.0]))
-    return np.asarray(selector.GetOutputPort("waypoint").Eval(context))
+    return evaluate(selector, time=time, hypotheses=vector, state=hover_state([7.0, 8.0, 9.0]))
 
 
 def test_selector_follows_the_cheapest_a_lookahead_ahead():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.systems.policies.base import Observation
+from splatpilot.systems.policies.base import observation
 from splatpilot.systems.policies.lattice import LatticeConfig, final_velocities
 from splatpilot.systems.policies.reactive import (
     ReactiveConfig,
@@ -14,9 +14,9 @@ from splatpilot.systems.policies.reactive import (
 )
 from splatpilot.systems.policies.velocity import RESPONSE_TIME
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
-from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 
 CONFIG = ReactiveConfig()
+STATE = hover_state([0.0, 0.0, 2.0])
 
 
 def empty_image() -> np.ndarray:
@@ -58,11 +58,8 @@ def cost_of(points_W, velocities, seen=True):
     p_WB, v_WB, p_WG = np.zeros(3), np.array([2.0, 0, 0]), np.array([10.0, 0, 0])
     velocities = np.array(velocities, dtype=float)
     positions = responses(p_WB, v_WB, velocities)
-    known = np.full(positions.shape[:2], seen)
-    points_W = np.reshape(points_W, (-1, 3))
-    return candidate_costs(
-        positions, velocities, p_WB, v_WB, p_WG, points_W, known, CONFIG
-    ), positions
+    rest = np.reshape(points_W, (-1, 3)), np.full(positions.shape[:2], seen), CONFIG
+    return candidate_costs(positions, velocities, p_WB, v_WB, p_WG, *rest), positions
 
 
 def test_contact_and_the_unseen_cost():
@@ -88,19 +85,14 @@ def test_candidates_are_those_of_the_planner():
     assert np.arctan2(v[:, 1], v[:, 0]).max() == pytest.approx(yaw)
 
 
-def observe(depth: np.ndarray, yaw: float, p_WG: list[float]) -> Observation:
-    state = hover_state([0.0, 0.0, 2.0], yaw)
-    return Observation(0.0, pose_from_state(state), QuadrotorState.of(state), np.array(p_WG), depth)
-
-
 NO_POINTS = np.full((CONFIG.memory * CONFIG.rows * CONFIG.columns, 3), np.nan)
 
 
 def test_flies_ahead_in_the_open_and_aside_of_a_post():
-    post = empty_image()
+    post, p_WG = empty_image(), np.array([10.0, 0.0, 2.0])
     post[:, 26:34] = 2.0  # From left of the middle to just right of it.
     ahead, right, left = (
-        compute_command(observe(depth, 0.0, [10.0, 0.0, 2.0]), NO_POINTS, CONFIG)[0]
+        compute_command(observation(0.0, STATE, p_WG, depth), NO_POINTS, CONFIG)[0]
         for depth in (empty_image(), post, post[:, ::-1])
     )
     assert ahead[0] > 3.0 and np.abs(ahead[1:]).max() < 0.5
@@ -110,7 +102,8 @@ def test_flies_ahead_in_the_open_and_aside_of_a_post():
 def test_remembers_points_that_are_no_longer_seen():
     config, points = ReactiveConfig(memory=2), NO_POINTS[: 2 * 144]
     for k, depth in enumerate((3.0, np.inf, np.inf, np.inf)):
-        seen = observe(np.full_like(empty_image(), depth), np.pi / 2, [0.0, 10.0, 2.0])
+        depth = np.full_like(empty_image(), depth)
+        seen = observation(0.0, hover_state([0, 0, 2], np.pi / 2), np.array([0.0, 10, 2]), depth)
         _, points = compute_command(seen, points, config)
         known = points[np.isfinite(points[:, 0])]
         assert len(known) == (144 if k < 2 else 0)

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpilot.systems.policies.base import Observation
+from splatpilot.systems.policies.base import Observation, observation
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.policies.lattice import reference_trajectory
@@ -21,7 +21,6 @@ from splatpilot.systems.policies.student import (
 )
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import hover_state
-from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 
 P_WG = np.array([12.0, 3.0, 2.0])
 CONFIGS = {"rgb": StudentRgbConfig, "depth": StudentDepthConfig}
@@ -54,7 +53,7 @@ def moving(p_WB, v_WB, yaw: float = 0.0) -> np.ndarray:
 
 
 def observe(state: np.ndarray, image: np.ndarray, p_WG=P_WG) -> Observation:
-    return Observation(0.0, pose_from_state(state), QuadrotorState.of(state), np.array(p_WG), image)
+    return observation(0.0, state, np.array(p_WG), image)
 
 
 def test_other_weights_and_cameras_are_refused(files):

@@ -10,6 +10,7 @@ from splatpilot.systems.policies.velocity import (
 )
 from splatpilot.systems.vehicle.flatness import FlatnessController, FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, hover_state
+from tests.systems.vehicle.responses import evaluate
 
 
 def test_tracking_is_exponential_and_limited():
@@ -17,11 +18,9 @@ def test_tracking_is_exponential_and_limited():
     for _ in range(round(RESPONSE_TIME / step)):
         v = v + step * tracking_acceleration(v, desired)
     np.testing.assert_allclose(v, desired * (1 - np.exp(-1)), rtol=1e-3)
-    system = VelocityTracker()
-    context = system.CreateDefaultContext()
-    system.GetInputPort("state").FixValue(context, [9, 9, 9, 1, 0, -1, 1, 0, 0, 0, 0, 0, 0])
-    system.GetInputPort("velocity").FixValue(context, [1, 0, 7])
-    np.testing.assert_allclose(system.GetOutputPort("acceleration").Eval(context), [0, 0, 6])
+    state = [9, 9, 9, 1, 0, -1, 1, 0, 0, 0, 0, 0, 0]
+    found = evaluate(VelocityTracker(), state=state, velocity=[1, 0, 7])
+    np.testing.assert_allclose(found, [0, 0, 6])
 
 
 CONTROLLER = FlatnessControllerConfig(lookahead=0.5)
@@ -29,11 +28,7 @@ STATE = np.array([1.0, 2, 3, 0.5, -0.5, 0.2, 1, 0, 0, 0, 0, 0, 0])
 
 
 def setpoint(**inputs) -> np.ndarray:
-    system = VelocitySetpoint(CONTROLLER)
-    context = system.CreateDefaultContext()
-    for name, value in {"state": STATE, **inputs}.items():
-        system.GetInputPort(name).FixValue(context, value)
-    return system.GetOutputPort("velocity_setpoint").Eval(context)
+    return evaluate(VelocitySetpoint(CONTROLLER), **{"state": STATE} | inputs)
 
 
 def test_setpoints_lead_to_the_decision():

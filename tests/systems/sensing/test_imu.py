@@ -55,19 +55,15 @@ def test_an_imu_feels_wind_through_the_acceleration():
     np.testing.assert_allclose(force, [4.0 * PARAMS.drag, 0.0, 9.81], atol=1e-9)
 
 
-def test_white_noise_has_the_density():
-    config = Imu(**IDEAL | {"accelerometer_noise": 0.01, "gyroscope_noise": 0.001})
-    accelerometer, gyroscope = measure(config, 3, 8.0)
-    assert accelerometer.std(axis=0) == pytest.approx(0.01 * np.sqrt(200.0), rel=0.05)
-    assert gyroscope.std(axis=0) == pytest.approx(0.001 * np.sqrt(200.0), rel=0.05)
-
-
-def test_biases_walk():
-    config = Imu(**IDEAL | {"gyroscope_walk": 0.01})
-    gyroscope = np.vstack([measure(config, seed, 4.0)[1] for seed in range(3)])
-    steps = np.diff(gyroscope, axis=0)
-    small = np.abs(steps) < 0.01  # not those from one flight to the next
-    assert steps[small].std() == pytest.approx(0.01 / np.sqrt(200.0), rel=0.05)
+@pytest.mark.parametrize(
+    ("noisy", "walking"), [("accelerometer", "gyroscope"), ("gyroscope", "accelerometer")]
+)
+def test_white_noise_and_the_walk_of_biases_have_their_densities(noisy, walking):
+    config = Imu(**IDEAL | {f"{noisy}_noise": 0.01, f"{walking}_walk": 0.01})
+    measured = dict(zip(("accelerometer", "gyroscope"), measure(config, 3, 8.0), strict=True))
+    assert measured[noisy].std(axis=0) == pytest.approx(0.01 * np.sqrt(200.0), rel=0.05)
+    steps = np.diff(measured[walking], axis=0)
+    assert steps.std() == pytest.approx(0.01 / np.sqrt(200.0), rel=0.05)
 
 
 def test_noise_follows_from_seed_and_name():

@@ -8,6 +8,7 @@ from splatpilot.systems.sensing.imu import RangeFinder, RangeFinderSensor
 from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.moving_bodies import Bodies, MovingObstacles
 from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_gaussians
+from tests.systems.vehicle.responses import evaluate
 
 FIELD = AnalyticDistanceField(
     [HalfSpace([0, 0, 1], 0.0), Box(RigidTransform([4.0, 0.0, 0.5]), [2.0, 2.0, 1.0])],
@@ -18,12 +19,8 @@ FIELD = AnalyticDistanceField(
 
 def measure(X_WB: RigidTransform, time: float = 0.0, bodies=None, seed: int = 0, **fields) -> float:
     sensor = RangeFinderSensor(RangeFinder(**{"noise": 0.0} | fields), FIELD, seed)
-    context = sensor.CreateDefaultContext()
-    context.SetTime(time)
-    sensor.GetInputPort("body_pose").FixValue(context, X_WB)
-    if bodies is not None:
-        sensor.GetInputPort("moving").FixValue(context, AbstractValue.Make(bodies))
-    return sensor.get_output_port().Eval(context)[0]
+    moving = {"moving": AbstractValue.Make(bodies)} if bodies else {}
+    return evaluate(sensor, time=time, body_pose=X_WB, **moving)[0]
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from splatpilot.systems.sensing.time_of_flight import (
     after_packet,
     time_of_flight_grid,
 )
+from tests.systems.vehicle.responses import evaluate
 
 
 def pixel_by_pixel(depth: np.ndarray, top: int, bottom: int) -> np.ndarray:
@@ -38,11 +39,10 @@ def test_grid_is_that_of_a_loop_over_pixels():
     depth[generator.uniform(size=depth.shape) < 0.05] = 0.0
     grid = time_of_flight_grid(depth, TimeOfFlight())
     np.testing.assert_allclose(grid, pixel_by_pixel(depth, 0, 140), atol=1e-12)
-    system = TimeOfFlightGrid()
-    context, image = system.CreateDefaultContext(), ImageDepth32F(180, 240)
+    image = ImageDepth32F(180, 240)
     image.mutable_data[..., 0] = depth
-    system.get_input_port().FixValue(context, Value(image))
-    np.testing.assert_allclose(system.get_output_port().Eval(context), grid.ravel(), atol=1e-6)
+    found = evaluate(TimeOfFlightGrid(), depth_image_32f=Value(image))
+    np.testing.assert_allclose(found, grid.ravel(), atol=1e-6)
 
 
 def test_unmeasured_depth_is_far_and_frames_on_their_side_are_rotated_upright():

@@ -1,4 +1,6 @@
-"""Responses of vehicles to constant commands."""
+"""Values of systems' outputs, and responses of vehicles to constant commands."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -6,6 +8,16 @@ from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import System
 
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant
+
+
+def evaluate(system: System, output: str = "", time: float = 0.0, **inputs: Any) -> Any:
+    """Returns the value of an output, by default of the only one, for values of inputs."""
+    context = system.CreateDefaultContext()
+    context.SetTime(time)
+    for name, value in inputs.items():
+        system.GetInputPort(name).FixValue(context, value)
+    port = system.GetOutputPort(output) if output else system.get_output_port()
+    return port.Eval(context)
 
 
 def simulate(plant: System, step: float) -> Simulator:

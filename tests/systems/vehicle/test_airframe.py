@@ -4,12 +4,10 @@ import pytest
 from splatpilot.systems.vehicle.airframe import QuadrotorAirframe
 from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant, hover_state
 from splatpilot.systems.vehicle.vehicles import Crazyflie21Brushless, Kingfisher, Px4Sih
-from tests.systems.vehicle.responses import fly
+from tests.systems.vehicle.responses import evaluate, fly
 
 START = hover_state([1.0, -2.0, 3.0], yaw=0.7)
 KINGFISHER = Kingfisher(ground_effect=0.3, battery_sag=0.2, battery_endurance=200.0)
-
-
 COMMANDS = np.random.default_rng(4).uniform([6.0, -3.0, -3.0, -2.0], [15.0, 3.0, 3.0, 2.0], (10, 4))
 
 
@@ -27,10 +25,7 @@ def test_rigid_body_with_propellers_flies_as_the_equations_of_the_rotors(params)
 
 
 def test_acceleration_is_that_of_the_plant():
-    found = []
-    for plant in (QuadrotorPlant(KINGFISHER, START), QuadrotorAirframe(KINGFISHER, START)):
-        context = plant.CreateDefaultContext()
-        plant.GetInputPort("command").FixValue(context, [12.0, 0.0, 0.0, 0.0])
-        plant.GetInputPort("wind").FixValue(context, [3.0, 0.0, 0.0])
-        found.append(plant.GetOutputPort("acceleration").Eval(context))
-    np.testing.assert_allclose(found[1], found[0], atol=1e-12)
+    inputs = {"command": [12.0, 0.0, 0.0, 0.0], "wind": [3.0, 0.0, 0.0]}
+    plants = QuadrotorPlant(KINGFISHER, START), QuadrotorAirframe(KINGFISHER, START)
+    expected, found = (evaluate(plant, "acceleration", **inputs) for plant in plants)
+    np.testing.assert_allclose(found, expected, atol=1e-12)

@@ -19,15 +19,15 @@ from splatpilot.systems.vehicle.state import (
     predict_state,
     rotation_matrices,
 )
+from tests.systems.vehicle.responses import evaluate
 
 
 @pytest.mark.parametrize("x", [np.arange(13.0), torch.arange(78.0).reshape(2, 3, 13)])
 def test_parts_are_views_where_the_plant_has_them(x):
     state = QuadrotorState.of(x)
-    np.testing.assert_array_equal(state.p_WB, x[..., [0, 1, 2]])
-    np.testing.assert_array_equal(state.v_WB, x[..., [3, 4, 5]])
-    np.testing.assert_array_equal(state.q_WB, x[..., [6, 7, 8, 9]])
-    np.testing.assert_array_equal(state.w_WB_B, x[..., [10, 11, 12]])
+    columns = ([0, 1, 2], [3, 4, 5], [6, 7, 8, 9], [10, 11, 12])
+    for part, index in zip(state, columns, strict=True):
+        np.testing.assert_array_equal(part, x[..., index])
     np.testing.assert_array_equal(state.to_vector(), x)
     state.v_WB[..., 1] = -3.0
     assert (x[..., 4] == -3.0).all() and (x == -3.0).sum() == len(x[..., 0].ravel())
@@ -44,22 +44,13 @@ def test_heading_and_tilt_are_those_of_the_body_axes():
     np.testing.assert_allclose(state.tilt, np.arccos(z_W[:, 2]), atol=1e-7)
 
 
-def pose_of(state):
-    system = StateToPose()
-    context = system.CreateDefaultContext()
-    system.GetInputPort("state").FixValue(context, state)
-    X_WB = system.GetOutputPort("pose").Eval(context)
-    assert isinstance(X_WB, RigidTransform)
-    return X_WB
-
-
 @settings(max_examples=30)
 @given(q=st.lists(st.floats(-2, 2), min_size=4, max_size=4))
 def test_pose_has_the_position_and_the_attitude_of_the_normalized_quaternion(q):
     assume(np.linalg.norm(q) > 1e-6)
     state = np.arange(13.0)
     state[6:10] = q
-    X_WB = pose_of(state)
+    X_WB = evaluate(StateToPose(), state=state)
     np.testing.assert_array_equal(X_WB.translation(), [0.0, 1.0, 2.0])
     expected = Rotation.from_quat(q, scalar_first=True).as_matrix()
     np.testing.assert_allclose(X_WB.rotation().matrix(), expected, atol=1e-12)
@@ -70,7 +61,7 @@ def test_an_invalid_quaternion_is_an_error(w):
     state = hover_state([0.0, 0.0, 0.0])
     state[6] = w
     with pytest.raises(ValueError, match=f"q_WB must be .* got \\[{w}, "):
-        pose_of(state)
+        evaluate(StateToPose(), state=state)
 
 
 NUMBERS = st.floats(-3, 3)
@@ -95,12 +86,9 @@ def test_predicted_motion_is_that_of_drakes_rotations(p, v, axis, w, duration):
     ("age", "moved"), [(0.0, 0.0), (0.05, 0.1), (0.5, 0.2), (-1.0, 0.0), (np.inf, 0.2)]
 )
 def test_ages_of_predictions_are_clipped(age, moved):
-    system = StatePredictor(longest=0.1)
-    context = system.CreateDefaultContext()
     state = np.array([1.0, 0, 0, 2, 0, 0, 1, 0, 0, 0, 0, 0, 0])
-    system.GetInputPort("measured_state").FixValue(context, state)
-    system.GetInputPort("age").FixValue(context, [age])
-    assert system.GetOutputPort("state").Eval(context)[0] == pytest.approx(1.0 + moved)
+    found = evaluate(StatePredictor(longest=0.1), measured_state=state, age=[age])
+    assert found[0] == pytest.approx(1.0 + moved)
 
 
 @pytest.mark.parametrize(("s", "yaw", "p"), [(0, 0.4, [1, 0, 0]), (0.5, 0.7, [2, 1, 0])])

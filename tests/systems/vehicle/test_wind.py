@@ -92,14 +92,10 @@ def test_numbers_are_parameters_of_the_context():
     np.testing.assert_allclose(source.get_output_port().Eval(context), 2 * gusts + [1, 2, 3])
     with pytest.raises(ValueError, match=r"Wind.gusts must be in .*, got -1"):
         source.SetGusts(context, -1.0)
+    after = source.EvalUniquePeriodicDiscreteUpdate(source.CreateDefaultContext()).value()
     for converted in (source.ToAutoDiffXd(), source.ToSymbolic()):
-        value = converted.get_output_port().Eval(converted.CreateDefaultContext())[0]
-        number = float(value.Evaluate()) if isinstance(value, Expression) else value.value()
-        assert number == pytest.approx(gusts[0])
-    context = source.CreateDefaultContext()
-    after = source.EvalUniquePeriodicDiscreteUpdate(context).value()
-    for converted in (source.ToAutoDiffXd(), source.ToSymbolic()):
-        found = converted.EvalUniquePeriodicDiscreteUpdate(converted.CreateDefaultContext())
-        number = found.value()[0]
-        number = float(number.Evaluate()) if isinstance(number, Expression) else number.value()
-        assert number == pytest.approx(after[0])
+        context = converted.CreateDefaultContext()
+        following = converted.EvalUniquePeriodicDiscreteUpdate(context).value()
+        found = [converted.get_output_port().Eval(context)[0], following[0]]
+        found = [x.Evaluate() if isinstance(x, Expression) else x.value() for x in found]
+        assert found == pytest.approx([gusts[0], after[0]])
