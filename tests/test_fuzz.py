@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 import trimesh
+from baked_scenes import random_scene
 from drake import lcmt_header
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -38,13 +39,7 @@ WIDTH, HEIGHT, FRAMES, COUNT = 16, 12, 6, 20
 R_WC = RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]))
 POSES = [RigidTransform(R_WC, [0.2 * i, 0.05 * i**2, 1.0]) for i in range(FRAMES)]
 RNG = np.random.default_rng(0)
-GAUSSIANS = sp.GaussianScene(
-    means=RNG.uniform(0, 3, (COUNT, 3)).astype(np.float32),
-    quats=RNG.normal(size=(COUNT, 4)).astype(np.float32),
-    scales=RNG.uniform(0.05, 0.2, (COUNT, 3)).astype(np.float32),
-    opacities=RNG.uniform(0.1, 0.9, COUNT).astype(np.float32),
-    sh=RNG.normal(size=(COUNT, 4, 3)).astype(np.float32),
-)
+GAUSSIANS = random_scene(COUNT, sh_degree=1)
 FOREIGN = gsply.GSData.from_arrays(
     GAUSSIANS.means,
     np.log(GAUSSIANS.scales),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from baked_scenes import random_scene
 
 import splatpilot as sp
 from splatpilot.analysis.commands.main import main
@@ -23,17 +24,11 @@ from splatpilot.systems.splats.background import EnvironmentMap
 @pytest.fixture
 def world() -> sp.World:
     rng = np.random.default_rng(0)
-    gaussians = sp.GaussianScene(
-        rng.uniform(0, 3, (50, 3)).astype(np.float32),
-        rng.normal(size=(50, 4)).astype(np.float32),
-        rng.uniform(0.01, 0.3, (50, 3)).astype(np.float32),
-        rng.uniform(0.1, 1.0, 50).astype(np.float32),
-        rng.uniform(-1, 1, (50, 4, 3)).astype(np.float32),
-    )
     distances = rng.uniform(0, 2, (6, 6, 6)).astype(np.float32)
     esdf = sp.Esdf(distances, np.zeros((6, 6, 6), np.uint8), np.zeros(3), 0.5)
     sky = EnvironmentMap(np.full((8, 16, 3), 0.5, np.float32))
-    return sp.World("shed", gaussians, esdf, esdf, sky, np.ones(3), 2 * np.ones(3))
+    gaussians, ends = random_scene(50, sh_degree=1), np.outer([1.0, 2.0], np.ones(3))
+    return sp.World("shed", gaussians, esdf, esdf, sky, *ends)
 
 
 @pytest.fixture
