@@ -253,10 +253,6 @@ class CaptureFrame:
         """The slopes (H, W, 2) of the pixels, see `pixel_slopes`."""
         return pixel_slopes(None, self.K, *self.depth.shape[::-1])
 
-    def back_project(self, u: NDArray, v: NDArray, depth: NDArray) -> NDArray[np.float64]:
-        """Returns the points p_CQ (..., 3) [m] at image coordinates [px] and depths [m]."""
-        return back_project(self.K, u, v, depth)
-
 
 @dataclass(frozen=True, eq=False)
 class SfmPoints:

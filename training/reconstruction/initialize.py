@@ -14,7 +14,7 @@ from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import FAR
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.training.captures.capture import Capture, CaptureFrame
+from splatpilot.training.captures.capture import Capture, CaptureFrame, back_project
 from splatpilot.training.captures.photographs import triangulate
 from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
 from splatpilot.training.reconstruction.photometry import (
@@ -177,7 +177,7 @@ def cell_gaussians(
     t_v = s dP/dv, with P = r / w along the pixel's ray r."""
     f_u, f_v = frame.K[0, 0], frame.K[1, 1]
     z = 1 / cells.w
-    P = frame.back_project(cells.u, cells.v, z)  # (n, 3)
+    P = back_project(frame.K, cells.u, cells.v, z)  # (n, 3)
     # Limits the slope of surfaces at grazing angles.
     tilt = z * np.hypot(f_u * cells.w_u, f_v * cells.w_v)
     limit = np.minimum(1, _MAX_STRETCH / np.maximum(tilt, 1e-12))
@@ -394,6 +394,6 @@ def random_points(
         z = 1 / rng.uniform(1 / far, 1 / near, each)
         valid = frame.valid[v.astype(int), u.astype(int)]
         u, v, z = u[valid], v[valid], z[valid]
-        points.append(frame.X_WC.multiply(frame.back_project(u, v, z).T).T)
+        points.append(frame.X_WC.multiply(back_project(frame.K, u, v, z).T).T)
         colors.append(frame.image[v.astype(int), u.astype(int)] / 255)
     return np.concatenate(points)[:count], np.concatenate(colors)[:count]

@@ -219,8 +219,8 @@ class SplatParameters:
         """Takes a step of Adam with these learning rates, and clears the gradients."""
         for name, tensor in self._tensors.items():
             if tensor.grad is not None:
-                state = [[each] for each in (tensor, tensor.grad, *self._averages[name])]
-                adam(*state[:4], [], state[4], lr=rates[name], **_ADAM)
+                mean, square, count = ([each] for each in self._averages[name])
+                adam([tensor], [tensor.grad], mean, square, [], count, lr=rates[name], **_ADAM)
                 tensor.grad = None
         self._clamp_scales()
 

@@ -27,10 +27,8 @@ _CODES = 65535  # of cached depth: 0 is unknown, the last is FAR, equal ratios a
 _OUTLINES = 4  # share of a view's steps that fit outlines, relative to that of sky in it
 _SPARSE = 4  # one in so many pixels along each axis gives the mean color and the median depth
 _HEIGHT, _WIDTH = 128, 256  # texels of the background, powers of two
-
-
 _DEPTHS = np.geomspace(_MIN_DEPTH, FAR, _CODES).astype(np.float32)
-_DEPTHS = np.concatenate([np.float32([0]), _DEPTHS[:-1], np.float32([np.inf])])
+_DEPTHS = np.concatenate([[0], _DEPTHS[:-1], [np.inf]], dtype=np.float32)
 
 
 class ShrunkFrames(Sequence[CaptureFrame]):

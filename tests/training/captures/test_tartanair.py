@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from room import LOWER_W, UPPER_W, room_color, write_room_capture
 
+from splatpilot.training.captures.capture import back_project
 from splatpilot.training.captures.capture_registry import read_capture
 
 
@@ -19,7 +20,7 @@ def test_world_is_north_west_up(room):
     np.testing.assert_array_equal(capture.K, [[32, 0, 32], [0, 32, 24], [0, 0, 1]])
     v, u = np.mgrid[0:48, 0:64] + 0.5
     for frame in capture.frames():
-        p_CQ = frame.back_project(u, v, frame.depth.astype(float))
+        p_CQ = back_project(frame.K, u, v, frame.depth.astype(float))
         p_W = frame.X_WC.multiply(p_CQ.reshape(-1, 3).T).T.reshape(48, 64, 3)
         assert np.abs(np.minimum(p_W - LOWER_W, UPPER_W - p_W).min(axis=-1)).max() < 1e-5
         color = room_color(p_W * [1, -1, -1])

@@ -9,7 +9,7 @@ from room import write_room_capture
 from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_files import read_ply
-from splatpilot.training.captures.capture import CaptureFrame, SfmPoints, no_depth
+from splatpilot.training.captures.capture import CaptureFrame, SfmPoints, back_project, no_depth
 from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
@@ -105,7 +105,7 @@ def test_without_depth_from_points(tmp_path):
     capture, p_WQ, colors = read_capture(dim), [], []
     rows, columns = np.mgrid[2:48:4, 2:64:4]
     for frame in capture.frames():
-        p_CQ = frame.back_project(columns + 0.5, rows + 0.5, frame.depth[rows, columns])
+        p_CQ = back_project(frame.K, columns + 0.5, rows + 0.5, frame.depth[rows, columns])
         p_WQ.append(frame.X_WC.multiply(p_CQ.reshape(-1, 3).T).T)
         colors.append(frame.image[rows, columns].reshape(-1, 3) / 255)
     points = SfmPoints(np.concatenate(p_WQ), np.concatenate(colors))
