@@ -43,17 +43,13 @@ class Distances(Protocol):
 
 
 class DistanceField(Distances, Protocol):
-    """A signed distance field over the box [lower_W, upper_W] of the world."""
+    """A signed distance field over the box [lower_W, upper_W], (3,) [m], of the world."""
 
     @property
-    def lower_W(self) -> np.ndarray:
-        """(3,) [m], the corner of the box with the smallest coordinates."""
-        ...
+    def lower_W(self) -> np.ndarray: ...
 
     @property
-    def upper_W(self) -> np.ndarray:
-        """(3,) [m], the corner of the box with the largest coordinates."""
-        ...
+    def upper_W(self) -> np.ndarray: ...
 
     def query(self, p_WQ: ArrayLike) -> FieldSample:
         """Returns distance, gradient and state at the points p_WQ (..., 3) [m]."""
@@ -80,8 +76,8 @@ def soft_barrier(distance: Any, radius: Any, beta: Any = 4.0, margin: Any = 1.0)
 
         soft(d) = softplus(beta (radius + margin - d)) / beta
 
-    The signed distance (...,) [m] is a numpy array, float or torch tensor. AutoDiffXd may be among
-    all arguments. NaN in, NaN out.
+    The signed distance (...,) [m] is a numpy array, float or torch tensor; all arguments may have
+    AutoDiffXd.
     """
     require(beta > 0.0, "beta", "> 0 1/m", beta)
     exponent = beta * (radius + margin - distance)

@@ -28,10 +28,8 @@ _SIZES = np.unique(np.r_[0:9, np.ceil(8 * 1.25 ** np.arange(60))].astype(int))
 
 
 def grid_shape(lower_W: np.ndarray, upper_W: np.ndarray, voxel_size: float) -> tuple[int, int, int]:
-    """Returns the number of voxels along each axis that cover the box [lower_W, upper_W].
-
-    The last may reach beyond it. Grids have at least 2 voxels an axis and at most `MAX_VOXELS`.
-    """
+    """Returns the numbers of voxels that cover the box [lower_W, upper_W], at least 2 an axis and at
+    most `MAX_VOXELS`."""
     extent = np.asarray(upper_W, dtype=float) - np.asarray(lower_W, dtype=float)
     valid = extent.shape == (3,) and np.isfinite(extent).all() and (extent > 0.0).all()
     require(valid, "upper_W", f"finite and above lower_W = {lower_W} m", upper_W)
@@ -40,14 +38,9 @@ def grid_shape(lower_W: np.ndarray, upper_W: np.ndarray, voxel_size: float) -> t
     count = np.ceil(extent / voxel_size - 1e-6)
     box = f"a box of {extent} m with voxels of {voxel_size} m"
     require(count.min() >= 2, box, "at least 2 voxels along each axis", count)
-    limit = f"at most {MAX_VOXELS:.3g} voxels"
-    require(
-        count.prod() <= MAX_VOXELS,
-        box,
-        limit,
-        f"{count.prod():.3g}",
-        "use larger voxels or a smaller box",
-    )
+    limit, total = f"at most {MAX_VOXELS:.3g} voxels", f"{count.prod():.3g}"
+    remedy = "use larger voxels or a smaller box"
+    require(count.prod() <= MAX_VOXELS, box, limit, total, remedy)
     nx, ny, nz = count.astype(int)
     return int(nx), int(ny), int(nz)
 
@@ -109,12 +102,12 @@ def _band(occupied: np.ndarray, offset: np.ndarray, voxel_size: float) -> np.nda
 def esdf_from_gaussians(
     scene: GaussianScene, voxel_size: float, lower_W: np.ndarray, upper_W: np.ndarray
 ) -> Esdf:
-    """Computes the distance field of the solid where the Gaussians' density reaches 0.5.
+    """Computes the distance field, in the box [lower_W, upper_W], of the solid where the Gaussians'
+    density reaches 0.5.
 
     The density is sum_i o_i exp(-m_i^2 / 2) with m_i the Mahalanobis distance to Gaussian i, whose
     variances are enlarged by (voxel_size / 2)^2 so that thin sheets do not fall between voxels.
-    Sheets are then trimmed to 0.6 voxel on both sides of their middle, half a voxel on the safe
-    side. The field fills the box [lower_W, upper_W], (3,) [m].
+    Sheets are then trimmed to 0.6 voxel on both sides of their middle.
     """
     shape = grid_shape(lower_W, upper_W, voxel_size)
     density = density_on_grid(scene, np.asarray(lower_W, dtype=float), shape, voxel_size)
@@ -144,40 +137,26 @@ def density_on_grid(
     density = np.zeros(np.prod(shape), dtype=np.float32)
     touching = np.flatnonzero(extent.all(axis=1))
     boxes, group = np.unique(extent[touching], axis=0, return_inverse=True)
+    batches = []
     order = touching[np.argsort(group, kind="stable")]
-    counts = np.bincount(group, minlength=len(boxes))
-    with Progress(total=len(order), desc="density of Gaussians", unit="", delay=2.0) as progress:
-        for box, group_end, count in zip(boxes, counts.cumsum(), counts, strict=True):
+    for box, same in zip(boxes, np.split(order, np.bincount(group)[:-1].cumsum()), strict=False):
+        step = max(1, _CHUNK // box.prod())
+        batches += [(box, same[start : start + step]) for start in range(0, len(same), step)]
+    total = len(touching)
+    with Progress(total=total, desc="density of Gaussians", unit="", delay=2.0) as progress:
+        for box, n in batches:
             voxel = np.stack(np.unravel_index(np.arange(box.prod()), box), -1)  # (V, 3)
-            step = max(1, _CHUNK // len(voxel))
-            for start in range(group_end - count, group_end, step):
-                some = order[start : min(start + step, group_end)]
-                _splat(
-                    density, shape, first[some], voxel, mean[some], M[some], scene.opacities[some]
-                )
-                progress.update(len(some))
+            # M (first + voxel - mean): a constant for each Gaussian, and a product for all voxels.
+            at_first = np.einsum("nij,nj->ni", M[n], first[n] - mean[n]).astype(np.float32)
+            steps = M[n].astype(np.float32) @ voxel.T.astype(np.float32)  # (n, 3, V)
+            squared = np.square(steps + at_first[:, :, None]).sum(axis=1)  # (n, V)
+            value = scene.opacities[n, None] * np.exp(-0.5 * squared)
+            index = first[n].astype(np.intp)[:, None, :] + voxel  # (n, V, 3)
+            used = (squared < _SUPPORT**2) & (index < np.array(shape)).all(axis=-1)
+            flat = np.ravel_multi_index(tuple(index[used].T), shape)
+            np.add.at(density, flat, value[used])
+            progress.update(len(n))
     return density.reshape(shape)
-
-
-def _splat(
-    density: np.ndarray,
-    shape: tuple[int, int, int],
-    first: np.ndarray,
-    voxel: np.ndarray,
-    mean: np.ndarray,
-    M: np.ndarray,
-    opacity: np.ndarray,
-) -> None:
-    """Adds n Gaussians, each on the box of voxels `first` (n, 3) + `voxel` (V, 3)."""
-    # M (first + voxel - mean), as a constant for each Gaussian and a product for all voxels.
-    at_first = np.einsum("nij,nj->ni", M, first - mean).astype(np.float32)  # (n, 3)
-    steps = M.astype(np.float32) @ voxel.T.astype(np.float32)  # (n, 3, V)
-    squared = np.square(steps + at_first[:, :, None]).sum(axis=1)  # (n, V)
-    value = opacity[:, None] * np.exp(-0.5 * squared)
-    index = first.astype(np.intp)[:, None, :] + voxel  # (n, V, 3)
-    used = (squared < _SUPPORT**2) & (index < np.array(shape)).all(axis=-1)
-    flat = np.ravel_multi_index(tuple(index[used].T), shape)
-    np.add.at(density, flat, value[used])
 
 
 def _surface_offset(density: np.ndarray, voxel_size: float) -> np.ndarray:
@@ -200,10 +179,8 @@ def _surface_offset(density: np.ndarray, voxel_size: float) -> np.ndarray:
 
 
 def esdf_from_distance_field(field: DistanceField, voxel_size: float) -> Esdf:
-    """Samples a distance field at the voxel centers of a grid over its bounds.
-
-    Centers beyond the bounds, if these are not whole voxels apart, take the nearest value inside.
-    """
+    """Samples a distance field at the voxel centers of a grid over its bounds; centers beyond them
+    take the nearest value inside."""
     lower_W, upper_W = np.asarray(field.lower_W, float), np.asarray(field.upper_W, float)
     shape = grid_shape(lower_W, upper_W, voxel_size)
     distances = np.empty(shape, dtype=np.float32)
@@ -221,10 +198,8 @@ def esdf_from_distance_field(field: DistanceField, voxel_size: float) -> Esdf:
 def cubes_of_points(
     x: np.ndarray, y: np.ndarray, z: np.ndarray
 ) -> Iterator[tuple[tuple[slice, slice, slice], np.ndarray]]:
-    """Yields the points of a grid in cubes of 16 points a side: slices and points (n, n, n, 3).
-
-    Fields find the nearest of many shapes faster for points that lie close together.
-    """
+    """Yields slices and points (n, n, n, 3) of a grid in cubes of 16 points a side: fields find the
+    nearest of many shapes faster for points that lie close together."""
     for i, j, k in itertools.product(*(range(0, len(axis), 16) for axis in (x, y, z))):
         part = np.s_[i : i + 16, j : j + 16, k : k + 16]
         axes = np.meshgrid(x[part[0]], y[part[1]], z[part[2]], indexing="ij")

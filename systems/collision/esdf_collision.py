@@ -48,12 +48,11 @@ def EsdfCollision_(T):
             input_ports: [state, moving (optional)]
             output_ports: [distance, gradient, clearance, in_collision, barrier, field_state]
 
-        `state` is that of a `QuadrotorState`. `distance` [m] is that of p_WB to occupied surfaces,
-        `gradient` its derivative by p_WB in W, `clearance` [m] the distance less the radius of the
-        vehicle, `in_collision` 1 if that is negative, `barrier` [m] equation 3, see `soft_barrier`,
-        and `field_state` a `FieldState`. Outside the field's bounds distance, clearance and barrier
-        are NaN, the gradient is zero and there is no collision. All outputs share one query of the
-        field, with the bodies of `moving`, see `MovingBodies`.
+        `distance` [m] is that of p_WB to occupied surfaces and bodies of `moving`, see
+        `MovingBodies`, `gradient` its derivative by p_WB in W, `clearance` [m] the distance less
+        the radius of the vehicle, `in_collision` 1 if that is negative, `barrier` [m] that of
+        `soft_barrier`, and `field_state` a `FieldState`. Outside the field's bounds distance,
+        clearance and barrier are NaN, the gradient is zero and there is no collision.
 
         Numeric parameter 0 (3): ``[radius [m], beta [1/m], margin [m]]``. Supports the scalars
         float and AutoDiffXd, by the exact gradient; `gradient` itself has zero derivatives, and so
@@ -100,13 +99,10 @@ def EsdfCollision_(T):
 
                 self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc=tickets)
 
-            def hit(sample, parameters):
-                return 1.0 * in_collision(sample.distance, parameters[0])
-
             declare("distance", lambda sample, _: sample.distance)
             declare("gradient", lambda sample, _: sample.gradient, 3)
             declare("clearance", lambda sample, each: sample.distance - each[0])
-            declare("in_collision", hit)
+            declare("in_collision", lambda each, p: 1.0 * in_collision(each.distance, p[0]))
             declare("barrier", lambda sample, each: soft_barrier(sample.distance, *each.value()))
             declare("field_state", lambda sample, _: sample.state)
 
@@ -138,12 +134,11 @@ EsdfCollision = EsdfCollision_[None]
 def AddClearanceConstraint(
     prog: MathematicalProgram, field: DistanceField, p_WQ: np.ndarray, lower: float = VEHICLE_RADIUS
 ) -> Any:
-    """Adds the constraint distance(p_WQ) >= lower, and returns its Binding.
+    """Adds the constraint distance(p_WQ) >= lower [m], and returns its Binding.
 
     Args:
         field: has distances everywhere, as `Esdf.conservative`; NaN stops solvers.
         p_WQ: (3,) decision variables [m].
-        lower: [m].
     """
 
     def distance(p: Any) -> np.ndarray:
@@ -161,14 +156,8 @@ def AddBarrierCost(
     beta: float = 4.0,
     margin: float = 1.0,
 ) -> Any:
-    """Adds the `soft_barrier` of distance(p_WQ) to the cost, and returns its Binding.
-
-    Args:
-        field: has distances everywhere, as `Esdf.conservative`; NaN stops solvers.
-        p_WQ: (3,) decision variables [m].
-        radius, margin: [m].
-        beta: [1/m].
-    """
+    """Adds the `soft_barrier` of distance(p_WQ) to the cost, and returns its Binding; for arguments
+    see there and `AddClearanceConstraint`."""
     return prog.AddCost(
         lambda p: soft_barrier(_distance(field, p), radius, beta, margin), vars=_point(p_WQ)
     )

@@ -24,11 +24,11 @@ _MIN_DISTANCE = 0.1  # [voxels] Minimum distance of voxel centers: slivers fold,
 
 
 def field_mesh(esdf: Esdf, conservative: bool = False) -> "trimesh.Trimesh":
-    """Returns the surface at which a field's distance is 0, normals outwards.
+    """Returns the surface at which a field's distance is 0, watertight, normals outwards.
 
-    The mesh is watertight: solids end at the faces of the box. Its surface is within half a voxel
-    of the field's, with few triangles where that is flat. If `conservative`, unknown space and all
-    outside the box are solid too: a shell around free space, a voxel thick at the box's faces.
+    It is within half a voxel of the field's, with few triangles where that is flat. Solids end at
+    the faces of the box; if `conservative`, unknown space and all outside the box are solid too: a
+    shell around free space, a voxel thick at the box's faces.
     """
     import trimesh
 

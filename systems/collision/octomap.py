@@ -41,10 +41,8 @@ class Octomap:
         return self.resolution * (self.corners + self.sizes[:, None]).max(axis=0)
 
     def part(self, max_voxels: float) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the corners (3,) [m] of a box of at most `max_voxels` about the free space.
-
-        It is all of the map, or as high as the map and of its proportions.
-        """
+        """Returns the corners (3,) [m] of a box of at most `max_voxels` about the free space: the
+        map's, or as high as the map and of its proportions."""
         lower, upper = self.corners.min(axis=0), (self.corners + self.sizes[:, None]).max(axis=0)
         shape = (upper - lower).astype(float)
         shrunk = np.sqrt(min(1.0, max_voxels / shape.prod())) * shape[:2]

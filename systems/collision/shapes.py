@@ -165,11 +165,7 @@ class ShapeUnion:
 
 
 class AnalyticDistanceField:
-    """The distance field of a `ShapeUnion` within bounds.
-
-    Every point inside the bounds [lower_W, upper_W] is FREE or OCCUPIED. Outside: NaN, zero,
-    OUTSIDE.
-    """
+    """The distance field of a `ShapeUnion` within the bounds [lower_W, upper_W]."""
 
     def __init__(self, shapes: Sequence[Shape], lower_W: ArrayLike, upper_W: ArrayLike) -> None:
         self.lower_W = _point(lower_W, "lower_W").copy()
@@ -217,9 +213,7 @@ class SpheresInTime:
 
     def along(self, field: DistanceField, times: ArrayLike) -> "DistancesAlongTrajectories":
         """Returns the distances of trajectories sampled at `times` (S,), with the spheres."""
-        return DistancesAlongTrajectories(
-            [self.among(field, float(time)) for time in np.asarray(times)]
-        )
+        return DistancesAlongTrajectories([self.among(field, t) for t in np.asarray(times, float)])
 
 
 class MovingSpheres(SpheresInTime):
