@@ -28,8 +28,8 @@ _SIZES = np.unique(np.r_[0:9, np.ceil(8 * 1.25 ** np.arange(60))].astype(int))
 
 
 def grid_shape(lower_W: np.ndarray, upper_W: np.ndarray, voxel_size: float) -> tuple[int, int, int]:
-    """Returns the numbers of voxels that cover the box [lower_W, upper_W], at least 2 an axis and at
-    most `MAX_VOXELS`."""
+    """Returns the numbers of voxels that cover the box [lower_W, upper_W], at least 2 an axis, and
+    at most `MAX_VOXELS`."""
     extent = np.asarray(upper_W, dtype=float) - np.asarray(lower_W, dtype=float)
     valid = extent.shape == (3,) and np.isfinite(extent).all() and (extent > 0.0).all()
     require(valid, "upper_W", f"finite and above lower_W = {lower_W} m", upper_W)
