@@ -110,18 +110,16 @@ def BuildPx4Diagram(
             ports.publish_measurement("motion_capture", body, pose, pose_age)
 
     commander = Px4Commander(config.commander, inbox, mavlink, address, GRAVITY, tick=config.tick)
+    names = "heartbeat_age", "armed", "mode", "granted"
     ports.add(
         "commander",
         commander,
         setpoint=setpoint.GetOutputPort(codec.port),
         setpoint_age=setpoint.GetOutputPort("age"),
         bridge_mode=mode.get_output_port(0),
-        heartbeat_age=telemetry.GetOutputPort("heartbeat_age"),
-        armed=telemetry.GetOutputPort("armed"),
-        mode=telemetry.GetOutputPort("mode"),
-        granted=telemetry.GetOutputPort("granted"),
         motion_capture_pose=pose,
         motion_capture_age=pose_age,
+        **{name: telemetry.GetOutputPort(name) for name in names},
     )
 
     for name in ("state", "age", "heartbeat_age", "armed", "mode", "rejected"):

@@ -21,8 +21,8 @@ from splatpilot.systems.policies.hypotheses import (
 
 class Codec:
     """Converts a signal to messages of one channel and back. By default the signal is a vector of
-    the message's `fields`, in their order. Quaternions, whose names begin with q, have length 1,
-    and all numbers are finite but those of `unbounded` fields."""
+    the message's `fields`, in their order. Quaternions (q_...) have length 1, and numbers are
+    finite, but those of `unbounded` fields."""
 
     channel: ClassVar[str]
     port: ClassVar[str]  # Name of the ports of the signal.
@@ -49,30 +49,24 @@ class Codec:
     def pack(self, value: np.ndarray, header: lcmt_header, epoch: float) -> Any:
         """Returns the message, or None without a value yet; `epoch` is the Unix time [s] of the
         Context's time 0."""
-        message, numbers = self.stamped(header), value.tolist()
+        message, numbers = self.stamped(header), iter(value.tolist())
         for name in self.fields:
             default = getattr(message, name)
-            if isinstance(default, list):
-                part, numbers = numbers[: len(default)], numbers[len(default) :]
-            else:
-                part, *numbers = numbers
-                part = type(default)(part)
+            is_list = isinstance(default, list)
+            part = [next(numbers) for _ in default] if is_list else type(default)(next(numbers))
             setattr(message, name, part)
         return message
 
     def unpack(self, message: Any, epoch: float) -> np.ndarray:
         """Returns the array of a message of the right type and frame; raises ValueError for invalid
         content."""
-        numbers, bounded = [], []
-        for name in self.fields:
-            part = getattr(message, name)
+        parts = {name: np.ravel(getattr(message, name)).astype(float) for name in self.fields}
+        for name, part in parts.items():
             if name.startswith("q_"):
                 require_unit_quaternion(part)
-            part = part if isinstance(part, tuple | list) else (part,)
-            numbers += part
-            bounded += part if name not in self.unbounded else ()
-        finite(bounded)
-        return np.array(numbers, dtype=float)
+            if name not in self.unbounded:
+                finite(part)
+        return np.concatenate([*parts.values()])
 
 
 class StateCodec(Codec):

@@ -43,6 +43,23 @@ SEVERITY = (
 _TOLERANCE = 1.01  # [-] by which a command may exceed the limits of its controller.
 
 
+@dataclass
+class FailsafeConfig(Config):
+    """Thresholds and timing of a failsafe."""
+
+    # [s] Max age of the state, the observation and the last sight by motion capture.
+    max_age: float = bounded(0.3, "(0, inf) s")
+    # [s] Max lag of the process behind the wall clock.
+    max_lag: float = bounded(0.3, "(0, inf) s")
+    # [s] Without faults, after which the policy flies again.
+    recovery: float = bounded(0.5, "(0, inf) s")
+    # [s] Of hovering after which the vehicle lands.
+    patience: float = bounded(5.0, "(0, inf) s")
+    # [m/s] Speed of landing.
+    descent: float = bounded(0.5, "(0, inf) m/s")
+    limits: FlightLimits = field(default_factory=FlightLimits)
+
+
 class Signals(NamedTuple):
     """Inputs of a failsafe at one instant."""
 
@@ -57,31 +74,23 @@ class Signals(NamedTuple):
 
     def state_is_valid(self, max_age: float) -> bool:
         """Checks that the state is neither too old, nor frozen, nor has jumped."""
-        newest = max(self.ages[status.STATE_OLD], self.unchanged)
-        return newest <= max_age and not self.jumped
+        return max(self.ages[status.STATE_OLD], self.unchanged) <= max_age and not self.jumped
 
-    def fault(
-        self,
-        max_age: float,
-        max_lag: float,
-        max_tilt: float,
-        law: FlatnessControllerConfig,
-        box: Box,
-    ) -> int:
+    def fault(self, config: FailsafeConfig, law: FlatnessControllerConfig, box: Box) -> int:
         """Returns the most severe fault, a reason of `lcmt_bridge_status`, or NONE. The limits of
         `law` hold for the command. The box must hold the vehicle, unless only commands are sent:
         their sender is responsible for the position."""
         max_rates = _TOLERANCE * np.array([law.max_tilt_rate, law.max_tilt_rate, law.max_yaw_rate])
-        max_thrust = _TOLERANCE * law.max_thrust
         thrust, rates, p_WB = self.command[0], self.command[1:], self.state.p_WB
-        faults = {reason: not age <= max_age for reason, age in self.ages.items()} | {
-            status.STATE_FROZEN: self.unchanged > max_age,
+        is_thrust = 0.0 <= thrust <= _TOLERANCE * law.max_thrust
+        faults = {reason: not age <= config.max_age for reason, age in self.ages.items()} | {
+            status.STATE_FROZEN: self.unchanged > config.max_age,
             status.STATE_JUMPED: self.jumped,
-            status.OVERRUN: self.lag > max_lag,
+            status.OVERRUN: self.lag > config.max_lag,
             status.POLICY_FAILED: self.policy_failed,
             status.NOT_FINITE: not np.isfinite(self.command).all(),
-            status.OUT_OF_BOUNDS: not 0.0 <= thrust <= max_thrust or (abs(rates) > max_rates).any(),
-            status.TILTED: self.state.tilt > max_tilt,
+            status.OUT_OF_BOUNDS: not is_thrust or (abs(rates) > max_rates).any(),
+            status.TILTED: self.state.tilt > config.limits.max_tilt,
         }
         if self.setpoint is not None:
             is_valid = np.isfinite(self.setpoint[:3]).all() and not math.isinf(self.setpoint[3])
@@ -122,78 +131,50 @@ class Track(NamedTuple):
     def after(
         self,
         state: np.ndarray,
-        time: float,
+        age: float,
         now: float,
         max_gap: float,
         epoch: float,
         in_charge: bool,
     ) -> "Track":
-        """Adds a state (13,) that was measured at `time` [s].
+        """Adds a state (13,) that was measured `age` [s] ago.
 
         It has jumped if it is not where the velocities of the states have led, or not rotated as
         their angular velocities say. Small differences fade. A jump remains one until the state
         comes back, since the map does not fit to the position any more. Measurements more than
         `max_gap` [s] apart, or before and after a lag of the process, start again; if `in_charge`,
-        after a gap as after a stop, since a vehicle that is not heard is made to hover.
+        after a gap as after a stop with the same heading, since a vehicle that is not heard hovers.
         """
         if np.array_equal(state, self.state):
             return self
-        duration = time - self.time
-        has_lagged = abs(epoch - self.epoch) > _MAX_LAG
-        if duration > max_gap and in_charge and not has_lagged and math.isfinite(duration):
-            return self._after_gap(state, time, now)
-        if not 0.0 < duration <= max_gap or has_lagged:
-            return Track(time, now, 0.0, epoch, state, state)
+        duration, has_lagged = now - age - self.time, abs(epoch - self.epoch) > _MAX_LAG
+        is_gap = duration > max_gap and in_charge and math.isfinite(duration)
+        if has_lagged or not (is_gap or 0.0 < duration <= max_gap):
+            return Track(now - age, now, 0.0, epoch, state, state)
         old, new = QuadrotorState.of(self.state), QuadrotorState.of(state)
-        p_WB, _, q_WB, _ = QuadrotorState.of(self.expected)
-        mean = QuadrotorState(p_WB, (old.v_WB + new.v_WB) / 2, q_WB, (old.w_WB_B + new.w_WB_B) / 2)
-        expected = predict_state(mean.to_vector(), duration)
+        held = QuadrotorState.of(self.expected)
+        if is_gap:
+            turn = abs(math.remainder(float(new.heading - held.heading), math.tau))
+            speed, rate = np.linalg.norm(old.v_WB), np.linalg.norm(old.w_WB_B)
+            is_far = np.linalg.norm(new.p_WB - held.p_WB) > _POSITION_JUMP + speed * _STOPPING
+            is_turned = turn > _ROTATION_JUMP + rate * _STOPPING
+            p_WB, q_WB = held.p_WB if is_far else new.p_WB, held.q_WB if is_turned else new.q_WB
+            expected = new._replace(p_WB=p_WB, q_WB=q_WB).to_vector()
+            return Track(now - age, now, float(is_far or is_turned), self.epoch, state, expected)
+        v_WB, w_WB_B = (old.v_WB + new.v_WB) / 2, (old.w_WB_B + new.w_WB_B) / 2
+        expected = predict_state(held._replace(v_WB=v_WB, w_WB_B=w_WB_B).to_vector(), duration)
         p_WB, _, q_WB, _ = QuadrotorState.of(expected)
         dot = float(q_WB.dot(new.q_WB))
-        distance = np.linalg.norm(new.p_WB - p_WB)
         angle = 2.0 * math.acos(min(abs(dot), 1.0))
         speed = max(np.linalg.norm(each.v_WB) for each in (old, new))
         rate = max(np.linalg.norm(each.w_WB_B) for each in (old, new))
-        jumped = (
-            distance > _POSITION_JUMP + speed * _TIME_ERROR
-            or angle > _ROTATION_JUMP + rate * max(duration, _TIME_ERROR)
-        )
+        is_far = np.linalg.norm(new.p_WB - p_WB) > _POSITION_JUMP + speed * _TIME_ERROR
+        jumped = is_far or angle > _ROTATION_JUMP + rate * max(duration, _TIME_ERROR)
         if not jumped:
             p_WB += duration / _FORGETTING * (new.p_WB - p_WB)
             q_WB += duration / _FORGETTING * (math.copysign(1.0, dot) * new.q_WB - q_WB)
             q_WB /= np.linalg.norm(q_WB)
-        return Track(time, now, float(jumped), epoch, state, expected)
-
-    def _after_gap(self, state: np.ndarray, time: float, now: float) -> "Track":
-        """Adds the first state after a gap, in which the vehicle stopped with its heading."""
-        old, new = QuadrotorState.of(self.state), QuadrotorState.of(state)
-        held = QuadrotorState.of(self.expected)
-        turn = abs(math.remainder(float(new.heading - held.heading), math.tau))
-        speed, rate = np.linalg.norm(old.v_WB), np.linalg.norm(old.w_WB_B)
-        is_far = np.linalg.norm(new.p_WB - held.p_WB) > _POSITION_JUMP + speed * _STOPPING
-        is_turned = turn > _ROTATION_JUMP + rate * _STOPPING
-        expected = new._replace(
-            p_WB=held.p_WB if is_far else new.p_WB, q_WB=held.q_WB if is_turned else new.q_WB
-        )
-        jumped = float(is_far or is_turned)
-        return Track(time, now, jumped, self.epoch, state, expected.to_vector())
-
-
-@dataclass
-class FailsafeConfig(Config):
-    """Thresholds and timing of a failsafe."""
-
-    # [s] Max age of the state, the observation and the last sight by motion capture.
-    max_age: float = bounded(0.3, "(0, inf) s")
-    # [s] Max lag of the process behind the wall clock.
-    max_lag: float = bounded(0.3, "(0, inf) s")
-    # [s] Without faults, after which the policy flies again.
-    recovery: float = bounded(0.5, "(0, inf) s")
-    # [s] Of hovering after which the vehicle lands.
-    patience: float = bounded(5.0, "(0, inf) s")
-    # [m/s] Speed of landing.
-    descent: float = bounded(0.5, "(0, inf) m/s")
-    limits: FlightLimits = field(default_factory=FlightLimits)
+        return Track(now - age, now, float(jumped), epoch, state, expected)
 
 
 _STOPPED = 0.3  # [m/s] below which a position is held instead of braking.
@@ -345,10 +326,9 @@ class Failsafe(LeafSystem):
         known obstacles. `controller` flies velocities; its limits hold for commands."""
         super().__init__()
         config.validate()
-        self._field = field
         self._config, self._controller, self._vehicle = config, controller, vehicle
         fence = config.limits.geofence or (lower_W, upper_W)
-        self._box = Box(*np.array(fence, dtype=float))
+        self._field, self._box = field, Box(*np.array(fence, dtype=float))
         for name, size in _INPUTS.items():
             self.DeclareVectorInputPort(name, size)
         self.DeclareDiscreteState(np.hstack(Modes()))
@@ -363,7 +343,7 @@ class Failsafe(LeafSystem):
         self._declare("command", 4, self._command)
         self._declare("mode", 2, self._mode)
         self._declare("state_is_known", 1, self._state_is_known)
-        self._declare("is_ready", 1, _is_ready)
+        self._declare("is_ready", 1, self._is_ready)
         self._declare("in_charge", 1, lambda context: self._is_in_charge(context) or False)
         self.DeclarePeriodicDiscreteUpdateEvent(controller.period, 0.0, self._update)
 
@@ -401,8 +381,7 @@ class Failsafe(LeafSystem):
         box = self._box
         if not (Modes.read(context).in_charge or self._is_in_charge(context)):
             box = Box(np.append(box.lower_W[:2], -math.inf), box.upper_W)
-        config, law = self._config, self._controller
-        return signals.fault(config.max_age, config.max_lag, config.limits.max_tilt, law, box)
+        return signals.fault(self._config, self._controller, box)
 
     def _is_in_charge(self, context: Context) -> bool | None:
         """Checks if an armed vehicle obeys; None if unknown."""
@@ -418,10 +397,10 @@ class Failsafe(LeafSystem):
         now, modes, signals = context.get_time(), Modes.read(context), self._signals(context)
         measured, age = optional_input(self, "measured_state", context), signals.ages
         if measured is not None and not math.isinf(age[status.STATE_OLD]):
-            time, epoch = now - age[status.STATE_OLD], self._number("unix_time", context, now) - now
+            epoch, max_gap = self._number("unix_time", context, now) - now, self._config.max_age
             in_charge = bool(modes.in_charge) and self._is_in_charge(context) is not False
-            max_gap = self._config.max_age
-            track = Track.read(context).after(measured, time, now, max_gap, epoch, in_charge)
+            times = age[status.STATE_OLD], now, max_gap, epoch
+            track = Track.read(context).after(measured, *times, in_charge)
             discrete_state.set_value(1, np.hstack(track))
         waits = any(map(math.isinf, age.values()))
         is_idle = waits and modes.mode == status.WAITING
@@ -445,13 +424,9 @@ class Failsafe(LeafSystem):
             deceleration, law = config.limits.deceleration, self._controller
             motion = Motion.predict(*signals.state[:2], age, unpredicted, deceleration, law)
         gradient = optional_input(self, "gradient", context)
-        near = Surroundings(
-            self._number("clearance", context, math.nan),
-            np.zeros(3) if gradient is None else gradient,
-            self._box,
-            self._field,
-            self._vehicle.radius,
-        )
+        gradient = np.zeros(3) if gradient is None else gradient
+        clearance = self._number("clearance", context, math.nan)
+        near = Surroundings(clearance, gradient, self._box, self._field, self._vehicle.radius)
         setpoint, limit = modes.setpoint(signals.setpoint, motion, near, config)
         value.set_value((setpoint, int(modes.mode), int(modes.reason) or limit))
 
@@ -461,27 +436,25 @@ class Failsafe(LeafSystem):
 
     def _command(self, context: Context) -> np.ndarray:
         setpoint, mode, reason = self._flown(context)
-        state = vector_input(self, "state", context)
+        state, vehicle = vector_input(self, "state", context), self._vehicle
         if mode == status.FLYING and reason == status.NONE:
             return vector_input(self, "command", context)
         if not np.isfinite(state).all():
-            return np.array([self._vehicle.gravity, 0.0, 0.0, 0.0])
+            return np.array([vehicle.gravity, 0.0, 0.0, 0.0])
         a_WB = tracking_acceleration(QuadrotorState.of(state).v_WB, setpoint[:3])
         motion_W = setpoint[:3] if mode == status.FLYING else np.zeros(3)
-        law, vehicle = self._controller, self._vehicle
-        return flatness_command(state, a_WB, motion_W, setpoint[3], law, vehicle)
+        return flatness_command(state, a_WB, motion_W, setpoint[3], self._controller, vehicle)
+
+    def _is_ready(self, context: Context) -> bool:
+        return Modes.read(context).mode != status.WAITING
 
     def _mode(self, context: Context) -> tuple[int, int]:
         waiting = status.WAITING, status.NONE
-        return self._flown(context)[1:] if _is_ready(context) else waiting
+        return self._flown(context)[1:] if self._is_ready(context) else waiting
 
     def _state_is_known(self, context: Context) -> bool:
         max_age = min(LONGEST_PREDICTION, self._config.max_age)
-        return _is_ready(context) and self._signals(context).state_is_valid(max_age)
-
-
-def _is_ready(context: Context) -> bool:
-    return Modes.read(context).mode != status.WAITING
+        return self._is_ready(context) and self._signals(context).state_is_valid(max_age)
 
 
 class FiniteVector(LeafSystem):

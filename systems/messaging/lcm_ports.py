@@ -22,6 +22,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from splatpilot.systems.common.drake import optional_input, vector_input, weak_callback
 from splatpilot.systems.common.files import require_unused
+from splatpilot.systems.common.readers import require_file
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.messaging.codecs import Codec
 from splatpilot.systems.messaging.receiver import RESTART, Received, Receiver
@@ -63,10 +64,9 @@ class BridgeStatus(LeafSystem):
         return [vector_input(self, name, context)[0] for name in names]
 
     def _calc_status(self, context: Context, output: BasicVector) -> None:
-        mode, overruns = vector_input(self, "mode", context), 0.0
-        if self.GetInputPort("overruns").HasValue(context):
-            overruns = vector_input(self, "overruns", context)[0]
-        ages = self._read(context, "age")
+        mode, ages = vector_input(self, "mode", context), self._read(context, "age")
+        overruns = optional_input(self, "overruns", context)
+        overruns = 0.0 if overruns is None else overruns[0]
         gaps, rejected = (sum(self._read(context, signal)) for signal in ("gaps", "rejected"))
         oldest = max(ages[1:], default=0.0)
         output.SetFromVector(np.array([*mode, ages[0], oldest, gaps, rejected, overruns]))
@@ -126,11 +126,10 @@ def open_lcm(url: str = DEFAULT_URL) -> LCM:
         "use a multicast group and a port that only LCM has, and give the host a multicast route "
         "(ip route add 224.0.0.0/4 dev lo)"
     )
-    heard = []
+    heard, deadline = [], time.monotonic() + 2.0
     try:
         lcm = LCM(url)
         probe = lcm.subscribe(_PROBE, lambda _, data: heard.append(data))
-        deadline = time.monotonic() + 2.0
         # LCM returns no subscription without a port, and prints the reason.
         while probe is not None and not heard and time.monotonic() < deadline:
             lcm.publish(_PROBE, b"")
@@ -355,10 +354,9 @@ def recorded(lcm: LCM, path: Path, overwrite: bool = False) -> Iterator[None]:
 
     def write(channel: str, data: bytes) -> None:
         nonlocal is_writable
-        if not is_writable:
-            return
         try:
-            log.write_event(time.time_ns() // 1000, channel, data)
+            if is_writable:
+                log.write_event(time.time_ns() // 1000, channel, data)
         except OSError as error:
             is_writable = False
             _log.warning("%s cannot be written, the log ends here: %s", path, error.strerror)
@@ -373,11 +371,9 @@ def recorded(lcm: LCM, path: Path, overwrite: bool = False) -> Iterator[None]:
 
 
 def replay(path: Path, lcm: LCM, simulator: Simulator, clock: UnixClock) -> None:
-    """Simulates a diagram while it receives the messages of a log at the times of their arrival.
-    The same log gives a bitwise identical simulation. The diagram, with its `clock`, has an LCM of
-    `memq://`; its time is 0, the time of the first message."""
-    if not path.is_file():
-        raise FileNotFoundError(f"No such file: {path}")
+    """Simulates a diagram, from time 0, that receives the messages of a log at the times of their
+    arrival, by an LCM of `memq://`, bitwise repeatably; `clock` is the diagram's."""
+    require_file(path)
     events = [(event.timestamp, event.channel, event.data) for event in EventLog(path)]
     require(events, str(path), "a log of LCM with messages", "none")
     root = simulator.get_mutable_context()

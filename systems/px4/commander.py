@@ -124,7 +124,7 @@ class Px4Commander(LeafSystem):
             name: (interval, int(self.DeclareDiscreteState(np.array(_Arrival()))))
             for name, interval in intervals.items()
         }
-        self.DeclareVectorOutputPort("ended", 1, _calc_ended, {self.xd_ticket()})
+        self.DeclareVectorOutputPort("ended", 1, self._calc_ended, {self.xd_ticket()})
         self.DeclarePeriodicDiscreteUpdateEvent(_PERIOD, 0.0, self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._look)
         self.DeclarePeriodicPublishEvent(_PERIOD, PUBLISH_OFFSET, self._publish)
@@ -215,15 +215,13 @@ class Px4Commander(LeafSystem):
 
     def _publish_setpoint(self, context: Context) -> None:
         now, memory = context.get_time() - PUBLISH_OFFSET, _Memory.read(context)
-        is_fresh = self._is_fresh(context, "setpoint_age")
         if memory.left:
             return
-        if not is_fresh:
+        setpoint = vector_input(self, "setpoint", context)
+        if not self._is_fresh(context, "setpoint_age"):
             if memory.flown and now - memory.ceased <= _BRAKING:
                 self._send(self._mavlink.velocity_setpoint(_STOP, now))
-            return
-        setpoint = vector_input(self, "setpoint", context)
-        if self._config.setpoints == "velocity":
+        elif self._config.setpoints == "velocity":
             self._send(self._mavlink.velocity_setpoint(setpoint, now))
         else:
             thrust = self._config.hover_thrust
@@ -238,6 +236,5 @@ class Px4Commander(LeafSystem):
         if abs(now - memory.asked) < 0.5 * _PERIOD and (request := self._request(context)):
             self._send(request)
 
-
-def _calc_ended(context: Context, output: BasicVector) -> None:
-    output[0] = _Memory.read(context).left != 0.0
+    def _calc_ended(self, context: Context, output: BasicVector) -> None:
+        output[0] = _Memory.read(context).left != 0.0

@@ -33,7 +33,7 @@ def thrust_to_px4(thrust: float, hover_thrust: float, gravity: float) -> float:
 
 
 _ONBOARD_COMPUTER = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
-_CUSTOM_MODE, _ARMED = 1, 128  # MAV_MODE_FLAGs
+CUSTOM_MODE, ARMED = 1, 128  # MAV_MODE_FLAGs
 _RESULTS = "ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS"
 _WARNING = 4  # MAV_SEVERITY_WARNING; more severe ones are smaller.
 SET_MODE, ARM = 176, 400  # Commands: MAV_CMD_DO_SET_MODE and MAV_CMD_COMPONENT_ARM_DISARM.
@@ -91,19 +91,19 @@ Message = Heartbeat | Position | Attitude | Timesync | Granted | Notice
 class Mavlink:
     """Writes and reads messages as the onboard computer of a vehicle."""
 
-    def __init__(self, system: int = 1) -> None:
-        self._dialect: Any = import_extra("pymavlink.dialects.v20.common", "px4")
+    def __init__(self, system: int = 1, component: int = _ONBOARD_COMPUTER) -> None:
+        self.dialect: Any = import_extra("pymavlink.dialects.v20.common", "px4")
         self._system = system
-        self._out = self._dialect.MAVLink(None, system, _ONBOARD_COMPUTER)
+        self._out = self.dialect.MAVLink(None, system, component)
 
     def velocity_setpoint(self, setpoint: np.ndarray, time: float) -> bytes:
         """Writes a velocity setpoint (4,): v_WB [m/s] and heading [rad], NaN to keep it; `time` [s]
         is since the start."""
         velocity, heading = swap_px4(setpoint[:3]), float(setpoint[3])
         free = math.isnan(heading)
-        return self._packed(
+        return self.packed(
             "set_position_target_local_ned",
-            *(_milliseconds(time), self._system, 1, self._dialect.MAV_FRAME_LOCAL_NED),
+            *(milliseconds(time), self._system, 1, self.dialect.MAV_FRAME_LOCAL_NED),
             VELOCITY_AND_YAW_RATE if free else VELOCITY_AND_YAW,
             *(0.0, 0.0, 0.0, *map(float, velocity), 0.0, 0.0, 0.0),
             0.0 if free else -heading,  # Yaw is clockwise.
@@ -115,9 +115,9 @@ class Mavlink:
     ) -> bytes:
         """Writes a command (4,): thrust over mass [m/s^2] and w_cmd_B [rad/s], see `thrust_to_px4`;
         `time` [s] is since the start."""
-        return self._packed(
+        return self.packed(
             "set_attitude_target",
-            *(_milliseconds(time), self._system, 1, BODY_RATES, [1.0, 0.0, 0.0, 0.0]),
+            *(milliseconds(time), self._system, 1, BODY_RATES, [1.0, 0.0, 0.0, 0.0]),
             *map(float, swap_px4(command[1:])),
             thrust_to_px4(float(command[0]), hover_thrust, gravity),
         )
@@ -125,8 +125,8 @@ class Mavlink:
     def odometry(self, pose: np.ndarray, utime: int) -> bytes:
         """Writes the pose (7,) of the vehicle in motion capture, p_WB [m] and q_WB (wxyz), at a
         Unix time [us]."""
-        d, unknown = self._dialect, [math.nan] + [0.0] * 20
-        return self._packed(
+        d, unknown = self.dialect, [math.nan] + [0.0] * 20
+        return self.packed(
             "odometry",
             *(utime, d.MAV_FRAME_LOCAL_FRD, d.MAV_FRAME_BODY_FRD),
             *map(float, swap_px4(pose[:3])),
@@ -138,13 +138,13 @@ class Mavlink:
 
     def heartbeat(self) -> bytes:
         """Writes the heartbeat of an onboard computer."""
-        d = self._dialect
+        d = self.dialect
         types = d.MAV_TYPE_ONBOARD_CONTROLLER, d.MAV_AUTOPILOT_INVALID
-        return self._packed("heartbeat", *types, 0, 0, d.MAV_STATE_ACTIVE, 3)
+        return self.packed("heartbeat", *types, 0, 0, d.MAV_STATE_ACTIVE, 3)
 
     def set_mode(self, mode: tuple[int, int]) -> bytes:
         """Writes a command for a mode."""
-        return self._command(SET_MODE, _CUSTOM_MODE, *mode)
+        return self._command(SET_MODE, CUSTOM_MODE, *mode)
 
     def arm(self) -> bytes:
         """Writes a command to arm the motors."""
@@ -152,20 +152,21 @@ class Mavlink:
 
     def timesync(self, timesync: Timesync) -> bytes:
         """Writes a request for the time, or an answer."""
-        return self._packed("timesync", *timesync)
+        return self.packed("timesync", *timesync)
 
     def _command(self, command: int, *parameters: float) -> bytes:
         padded = [*map(float, parameters), *[0.0] * (7 - len(parameters))]
-        return self._packed("command_long", self._system, 1, command, 0, *padded)
+        return self.packed("command_long", self._system, 1, command, 0, *padded)
 
-    def _packed(self, name: str, *values: Any) -> bytes:
-        message = getattr(self._dialect, f"MAVLink_{name}_message")(*values)
+    def packed(self, name: str, *values: Any) -> bytes:
+        """Writes a message of a type with the values of its fields."""
+        message = getattr(self.dialect, f"MAVLink_{name}_message")(*values)
         return bytes(message.pack(self._out))
 
     def read(self, packet: bytes) -> tuple[list[Message], list[str]]:
         """Reads the messages of a packet, and the reasons for rejecting others; ignores messages of
         other types and of other systems."""
-        parser = self._dialect.MAVLink(None)
+        parser = self.dialect.MAVLink(None)
         parser.robust_parsing = True  # Unknown messages are not errors.
         parsed = parser.parse_buffer(packet) or []
         bad = [message.reason for message in parsed if message.get_type() == "BAD_DATA"]
@@ -182,7 +183,8 @@ class Mavlink:
         return messages, refused
 
 
-def _milliseconds(time: float) -> int:
+def milliseconds(time: float) -> int:
+    """Converts seconds since the start to MAVLink's 32 bits of milliseconds."""
     return round(time * 1e3) & 0xFFFFFFFF
 
 
@@ -192,7 +194,7 @@ def _message(m: Any) -> list[Message]:
     match m.get_type():
         case "HEARTBEAT":
             mode = (m.custom_mode >> 16) & 0xFF, (m.custom_mode >> 24) & 0xFF
-            return [Heartbeat(bool(m.base_mode & _ARMED), mode)]
+            return [Heartbeat(bool(m.base_mode & ARMED), mode)]
         case "LOCAL_POSITION_NED":
             p, v = finite([m.x, m.y, m.z]), finite([m.vx, m.vy, m.vz])
             return [Position(1e-3 * m.time_boot_ms, swap_px4(p), swap_px4(v))]

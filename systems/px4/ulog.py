@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from splatpilot.systems.common.extras import import_extra
+from splatpilot.systems.px4 import mavlink
 
 _PERIOD = 0.0195  # [s] Minimum time between messages of a type: streams of 50 Hz, and jitter.
-_MODES = {4: (4, 3), 14: (6, 0), 18: (4, 6)}  # nav_state of hold, offboard and land.
+_MODES = {4: mavlink.HOLD, 14: mavlink.OFFBOARD, 18: mavlink.LAND}  # by nav_state
 _OTHER = (1, 0)  # Manual, for all modes that no part of this program knows.
-_ARMED, _CUSTOM_MODE = 128, 1  # MAV_MODE_FLAGs
 
 
 class LogInbox:
@@ -30,13 +30,13 @@ class LogInbox:
     port = 0
 
     def __init__(self, path: Path, system: int, now: Callable[[], float]) -> None:
-        self._dialect: Any = import_extra("pymavlink.dialects.v20.common", "px4")
-        self._link = self._dialect.MAVLink(None, system, 1)
-        self._parser = self._dialect.MAVLink(None)
+        self._link = mavlink.Mavlink(system, component=1)
+        self._parser = self._link.dialect.MAVLink(None)
         self._now, self._begin, self._next, self.sent = now, math.nan, 0, Counter[str]()
         topics = _read_topics(path)
         self.velocity_error = _velocity_error(topics["vehicle_local_position"])
-        packets = [*self._positions(topics), *self._attitudes(topics), *self._heartbeats(topics)]
+        rows = *self._positions(topics), *self._attitudes(topics), *self._heartbeats(topics)
+        packets = [(time, self._link.packed(*message)) for time, *message in rows]
         self._packets = sorted(packets, key=lambda packet: packet[0])
 
     def close(self) -> None:
@@ -60,21 +60,17 @@ class LogInbox:
             self._next += 1
         return [packet for _, packet in self._packets[first : self._next]], 0
 
-    def _packed(self, time: float, name: str, *values: Any) -> tuple[float, bytes]:
-        message = getattr(self._dialect, f"MAVLink_{name}_message")(*values)
-        return time, bytes(message.pack(self._link))
-
-    def _positions(self, topics: dict) -> list[tuple[float, bytes]]:
+    def _positions(self, topics: dict) -> list[tuple]:
         topic = topics["vehicle_local_position"]
         p_and_v = np.column_stack([topic[name] for name in ("x", "y", "z", "vx", "vy", "vz")])
         is_valid = (topic["xy_valid"] & topic["v_xy_valid"]).astype(bool)
         return [
-            self._packed(time, "local_position_ned", _milliseconds(time), *values.tolist())
+            (time, "local_position_ned", mavlink.milliseconds(time), *values.tolist())
             for time, values, valid in _at_50_hz(topic, p_and_v, is_valid)
             if valid
         ]
 
-    def _attitudes(self, topics: dict) -> list[tuple[float, bytes]]:
+    def _attitudes(self, topics: dict) -> list[tuple]:
         topic, gyro = topics["vehicle_attitude"], topics.get("vehicle_angular_velocity")
         q = np.column_stack([topic[f"q[{axis}]"] for axis in range(4)])
         if gyro is None:  # A log from before PX4 1.10.
@@ -83,21 +79,21 @@ class LogInbox:
             at, times = topic["timestamp"], gyro["timestamp"]
             rates = [np.interp(at, times, gyro[f"xyz[{axis}]"]) for axis in range(3)]
         return [
-            self._packed(time, "attitude_quaternion", _milliseconds(time), *quaternion, *w)
+            (time, "attitude_quaternion", mavlink.milliseconds(time), *quaternion, *w)
             for time, quaternion, w in _at_50_hz(topic, q.tolist(), np.transpose(rates).tolist())
         ]
 
-    def _heartbeats(self, topics: dict) -> list[tuple[float, bytes]]:
-        topic, d = topics["vehicle_status"], self._dialect
+    def _heartbeats(self, topics: dict) -> list[tuple]:
+        topic, d = topics["vehicle_status"], self._link.dialect
         times = 1e-6 * topic["timestamp"]
         packets = []
         for time in np.arange(times[0], topics["vehicle_attitude"]["timestamp"][-1] * 1e-6, 1.0):
             row = np.searchsorted(times, time, side="right") - 1
             main, sub = _MODES.get(int(topic["nav_state"][row]), _OTHER)
-            base = _CUSTOM_MODE | (_ARMED if topic["arming_state"][row] == 2 else 0)
+            base = mavlink.CUSTOM_MODE | (mavlink.ARMED if topic["arming_state"][row] == 2 else 0)
             kind = d.MAV_TYPE_QUADROTOR, d.MAV_AUTOPILOT_PX4
             values = *kind, base, (main << 16) | (sub << 24), d.MAV_STATE_ACTIVE, 3
-            packets.append(self._packed(float(time), "heartbeat", *values))
+            packets.append((float(time), "heartbeat", *values))
         return packets
 
 
@@ -113,10 +109,6 @@ def _read_topics(path: Path) -> dict[str, dict[str, np.ndarray]]:
     if missing := [name for name in required if name not in topics]:
         raise ValueError(f"{path} must have the topics {', '.join(missing)}")
     return topics
-
-
-def _milliseconds(time: float) -> int:
-    return round(time * 1e3) & 0xFFFFFFFF
 
 
 def _at_50_hz(topic: dict[str, np.ndarray], *columns: Any) -> list[tuple]:
