@@ -4,10 +4,11 @@ import operator
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 from pydrake.systems.framework import System
 
+from splatpilot.diagrams.flight.sensors import SensorConfig
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import require_configuration
 from splatpilot.systems.common.registry import Registry
@@ -37,22 +38,16 @@ from splatpilot.systems.policies.student import (
 from splatpilot.systems.policies.teleop import Teleop, TeleopConfig
 
 
-class PolicyConfig(Protocol):
+class PolicyConfig(SensorConfig, Protocol):
     """Configuration of a policy: a dataclass that imports without torch.
 
     Optional fields: `camera`, an `OnboardCamera`; `sensors`, configurations by name (see
     `diagrams/flight/sensors.py`); `weights`, a file.
     """
 
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
     @property
     def rate(self) -> float:
         """[Hz] of updates."""
-        ...
-
-    def validate(self) -> None:
-        """Raises ValueError for a value out of range."""
         ...
 
 

@@ -1,12 +1,10 @@
 """Scenario: everything that determines one flight, as a dataclass and as YAML."""
 
 from dataclasses import dataclass, field
-from functools import cache
 from math import inf
 from typing import ClassVar
 
 import numpy as np
-from pydrake.common.schema import Rotation, Transform
 from pydrake.geometry import Rgba
 from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.sensors import CameraConfig
@@ -34,6 +32,7 @@ from splatpilot.systems.policies.planner import PrivilegedPlannerConfig
 from splatpilot.systems.sensing.estimators import TrueState
 from splatpilot.systems.sensing.imaging import Imaging
 from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.systems.sensing.onboard_camera import level_mount
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, hover_state
 from splatpilot.systems.vehicle.vehicles import VEHICLES
@@ -58,16 +57,13 @@ WITHOUT_EFFECT = (
     "do_compress",
     "lcm_bus",
 )
+_IGNORED_DEFAULTS = {name: repr(getattr(CameraConfig(), name)) for name in WITHOUT_EFFECT}
 
 
 def _default_camera() -> CameraConfig:
     """Returns a forward-looking 320x240 camera; X_PB is its pose on the vehicle."""
     config = CameraConfig(name="camera", width=320, height=240, fps=15.0, z_near=0.1, z_far=20.0)
-    config.focal = CameraConfig.FovDegrees(x=90.0)
-    # Optical axes (x right, y down, z forward) from body axes (x forward, y left, z up).
-    config.X_PB = Transform(
-        translation=[0.1, 0.0, 0.0], rotation=Rotation(value=Rotation.Rpy(deg=[-90.0, 0.0, -90.0]))
-    )
+    config.focal, config.X_PB = CameraConfig.FovDegrees(x=90.0), level_mount()
     return config
 
 
@@ -268,11 +264,6 @@ def _check_rates(scenario: Scenario) -> None:
     require(exposure <= period, "imaging.exposure_time", condition, exposure, remedy)
 
 
-@cache
-def _ignored_defaults() -> dict[str, str]:
-    return {name: repr(getattr(CameraConfig(), name)) for name in WITHOUT_EFFECT}
-
-
 def _check_camera(camera: CameraConfig) -> None:
     pixels = camera.width * camera.height
     valid = camera.width > 1 and camera.height > 1 and pixels <= _MAX_PIXELS
@@ -289,7 +280,7 @@ def _check_camera(camera: CameraConfig) -> None:
     delay = camera.output_delay
     require(0.0 <= delay <= 1.0, "camera.output_delay", "in [0, 1] s", delay)
     require(0.01 <= camera.fps <= 1000, "camera.fps", "in [0.01, 1000] Hz", camera.fps)
-    for name, default in _ignored_defaults().items():
+    for name, default in _IGNORED_DEFAULTS.items():
         value = repr(getattr(camera, name))
         ignored = "a splat camera ignores it"
         require(value == default, f"camera.{name}", "left out", value, ignored)

@@ -13,8 +13,8 @@ from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 
 
-def _level_mount() -> Transform:
-    """Returns the pose of a camera at the front that looks ahead, in body axes."""
+def level_mount() -> Transform:
+    """Returns X_BC of a camera at the front that looks ahead."""
     rotation = Rotation(value=Rotation.Rpy(deg=[-90.0, 0.0, -90.0]))
     return Transform(translation=[0.1, 0.0, 0.0], rotation=rotation)
 
@@ -39,7 +39,7 @@ class OnboardCamera(Config):
     max_depth: float = bounded(20.0, "(0, inf) m")
     # Pose on the vehicle: axes x right, y down and z forward of the image in body axes x forward, y
     # left and z up. Its rotation !Rpy {deg: [UP - 90, 0, LEFT - 90]} looks up and left by angles.
-    X_BC: Transform = field(default_factory=_level_mount)
+    X_BC: Transform = field(default_factory=level_mount)
     # [s] Between reading the first row of an image and the last; 0 is a global shutter.
     readout: float = bounded(0.0, "[0, 0.2] s")
     # [px] Neighbors that spread by less on the image have one color. 2 makes RGB of 64x48 pixels

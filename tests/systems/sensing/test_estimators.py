@@ -148,7 +148,7 @@ class Course(LeafSystem):
     def _range(self, context, output) -> None:
         state = QuadrotorState.of(np.asarray(self.get_input_port().Eval(context)))
         [noise] = white_noise(self, 0, context.get_time(), 50.0, 1)
-        under = self._block if 4.0 < context.get_time() < 5.0 else 0.0
+        under = self._block if 1.0 < context.get_time() < 2.0 else 0.0
         height = (state.p_WB[2] - under) / np.cos(state.tilt)
         output.SetFromVector([height + 0.02 * noise])
 
@@ -192,7 +192,7 @@ def test_errors_are_those_that_the_covariance_states():
 
 
 def test_an_obstacle_below_does_not_change_the_height():
-    true, seen, _ = flown(0, 5.2, block=1.0)
+    true, seen, _ = flown(0, 2.2, block=1.0)
     assert np.abs(seen.p_WB - true.p_WB)[:, 2].max() < 0.1
     config = InertialFilter()
     config.height.direction = [1.0, 0.0, 0.0]
