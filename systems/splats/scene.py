@@ -224,7 +224,7 @@ class GaussianScene:
         return replace(self, **concatenated([self, other]))
 
 
-def concatenated(parts: Sequence[Any]) -> dict[str, NDArray[Any]]:
+def concatenated(parts: Sequence[Any]) -> dict[str, Any]:
     """Concatenates the `ARRAYS` of scenes or dictionaries; lower degrees of spherical harmonics are
     padded with zeros."""
     rows = [
