@@ -180,8 +180,6 @@ def AddFlight(
 
     Raises:
         InfeasibleFlightError: see `sample_initial_state`; also for vehicles that start in contact.
-        ValueError: for an invalid configuration, a system without the ports it needs, and a name
-            that is taken.
     """
     require_type(scenario, Scenario, "scenario")
     require_type(world, World, "world")
@@ -441,8 +439,7 @@ def BuildFlightDiagram(
         rerun: file of the system `rerun`, a `RerunSink`.
 
     Raises:
-        InfeasibleFlightError, ValueError: see `AddFlight`; also for Meshcat or video without the
-            camera, and an algebraic loop.
+        InfeasibleFlightError: see `AddFlight`.
     """
     valid = camera or not (video or meshcat is not None)
     require(valid, "camera", "True with meshcat or video, which show its images", camera)
@@ -535,7 +532,8 @@ def AddMeshcat(
         radius=parts.scenario.vehicle.radius,
     )
     if world.moving:
-        MovingSpheresVisualizer.AddToBuilder(builder, world.moving.spheres, meshcat)
+        visualizer = MovingSpheresVisualizer(meshcat, world.moving.spheres)
+        builder.AddNamedSystem("spheres_visualizer", visualizer)
     assert parts.camera is not None
     fps = parts.scenario.camera.fps
     CameraVisualizer.AddToBuilder(

@@ -82,9 +82,6 @@ def register_policy(
         config: type of its configurations, see `PolicyConfig`; its name is their YAML tag.
         build, speed_field: see `PolicyEntry`; a default field that is missing means a fixed speed.
         name: by default that of the type without "Config", in lower case.
-
-    Raises:
-        ValueError: if another policy has the name, or the type is not a configuration.
     """
     require_configuration(config)
     if speed_field == "speed" and "speed" not in {field.name for field in fields(config)}:

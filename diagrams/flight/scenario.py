@@ -175,9 +175,6 @@ def sample_scenario(scenario: Scenario) -> Scenario:
     """Returns the scenario with values drawn from its distributions, or itself without any.
 
     The values are of its seed and the path of their field alone.
-
-    Raises:
-        ValueError: for a distribution in a field that is not of numbers.
     """
     return sample_distributions(scenario, scenario.seed)
 

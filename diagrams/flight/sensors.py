@@ -57,9 +57,6 @@ def register_sensor(config: type, build: Callable[[Any, World, Any], System]) ->
     Args:
         config: type of its configurations, see `SensorConfig`; its name is their YAML tag.
         build: see `SensorEntry.build`.
-
-    Raises:
-        ValueError: if another sensor has the name, or the type is not a configuration.
     """
     require_configuration(config)
     SENSORS.add(config.__name__, SensorEntry(config, build))

@@ -106,9 +106,6 @@ def make_flight_simulator(diagram: Diagram, generator: RandomGenerator | None = 
     so that Drake's random sources repeat. All else that is random follows from the scenario's seed
     when the diagram is built, see `random_flights`. The Context's accuracy lets the flight end at
     the exact instant.
-
-    Raises:
-        ValueError: if the diagram has no `FlightMonitor`.
     """
     scenarios = [system.scenario for _, system in _require_monitors(diagram)]
     scenario, simulator = scenarios[0], Simulator(diagram)
@@ -139,7 +136,6 @@ def fly(
         The flight. Its outcome is `ERROR` if a system raised `InfeasibleFlightError` after time 0.
 
     Raises:
-        ValueError: if the diagram has none or several monitors; see `fly_all`.
         FlightError: from any other exception after time 0.
         KeyboardInterrupt: after Ctrl-C, whose `flight` is the record until then.
     """

@@ -119,13 +119,11 @@ def test_a_policy_keeps_its_configuration(post_world):
     assert np.linalg.norm(fly(diagram).states[:, 3:6], axis=1).max() < 1.1
 
 
-def test_flight_and_world_are_short_in_notebooks(post_world):
-    scenario = Scenario(timeout=0.5)
-    flight = fly(BuildFlightDiagram(scenario, post_world, camera=False))
-    assert re.fullmatch(r"Flight\(timeout after 0.50 s, min. clearance \+\d.\d\d m\)", repr(flight))
-    assert "<td>outcome</td><td>timeout</td>" in flight._repr_html_()
+def test_flight_and_world_are_short_in_notebooks(post_world, flight):
+    assert re.fullmatch(r"Flight\(goal after \d.\d\d s, min. clearance \+\d.\d\d m\)", repr(flight))
+    assert "<td>outcome</td><td>goal</td>" in flight._repr_html_()
     assert len(repr(post_world)) < 80
-    shown = flight_page(scenario, post_world, [flight])._repr_html_()
+    shown = flight_page(Scenario(), post_world, [flight])._repr_html_()
     assert shown.startswith("<iframe srcdoc=") and "&lt;title&gt;" in shown
 
 

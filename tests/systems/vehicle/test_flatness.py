@@ -6,9 +6,9 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
-from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import Linearize, VectorLogSink
+from pydrake.systems.primitives import Linearize, LogVectorOutput
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.vehicle.flatness import (
@@ -24,6 +24,7 @@ from splatpilot.systems.vehicle.quadrotor import (
     hover_state,
     quadrotor_derivatives,
 )
+from tests.systems.vehicle.responses import simulate
 
 CONFIG = FlatnessControllerConfig()
 PARAMS = QuadrotorParams(drag=0.4, gravity=9.7)
@@ -128,17 +129,13 @@ def fly(state, duration, *, config=None, params=None, **inputs):
     for port, function in inputs.items():
         signal = builder.AddSystem(Signal(function))
         builder.Connect(signal.get_output_port(), controller.GetInputPort(port))
-    sinks = []
-    for system, size in ((plant, 13), (controller, 4)):
-        sinks.append(builder.AddSystem(VectorLogSink(size, 0.02)))
-        builder.Connect(system.get_output_port(), sinks[-1].get_input_port())
-    simulator = Simulator(builder.Build())
-    ResetIntegratorFromFlags(simulator, "runge_kutta3", 0.02)
-    simulator.get_mutable_integrator().set_fixed_step_mode(True)
+    outputs = plant.get_output_port(), controller.get_output_port()
+    logs = [LogVectorOutput(port, builder, 0.02) for port in outputs]
+    simulator = simulate(builder.Build(), 0.02)
     context = simulator.get_mutable_context()
     context.SetContinuousState(state)
     simulator.AdvanceTo(duration)
-    states, commands = (sink.FindLog(context) for sink in sinks)
+    states, commands = (log.FindLog(context) for log in logs)
     return states.sample_times(), states.data().T, commands.data().T
 
 
@@ -275,21 +272,22 @@ def test_commands_are_limited_for_any_input(state, port, value):
     assert abs(command[3]) <= CONFIG.max_yaw_rate
 
 
-def test_one_of_the_two_targets_must_be_connected():
-    state, target = hover_state([0.0, 0.0, 0.0]), np.zeros(3)
-    with pytest.raises(ValueError, match="got neither"):
-        command_for(state=state)
-    with pytest.raises(ValueError, match="got both"):
-        command_for(state=state, waypoint=target, acceleration=target)
-
-
-@pytest.mark.parametrize("port", ["state", "waypoint", "acceleration"])
-def test_an_input_that_is_not_finite_is_an_error(port):
-    target = "acceleration" if port == "acceleration" else "waypoint"
-    inputs = {"state": hover_state([0.0, 0.0, 0.0]), target: np.zeros(3)}
-    inputs[port][1] = math.nan
-    with pytest.raises(ValueError, match=rf"input '{port}' .* at t = 0\.5 s must be finite"):
-        command_for(time=0.5, **inputs)
+@pytest.mark.parametrize(
+    ("inputs", "message"),
+    [
+        ({}, "got neither"),
+        ({"waypoint": np.zeros(3), "acceleration": np.zeros(3)}, "got both"),
+        (
+            {"state": np.full(13, np.nan), "waypoint": np.zeros(3)},
+            "'state' .* at t = 0.5 s must",
+        ),
+        ({"waypoint": [0.0, np.nan, 0.0]}, "'waypoint' .* at t = 0.5 s must be finite"),
+        ({"acceleration": [0.0, np.nan, 0.0]}, "'acceleration' .* at t = 0.5 s must be finite"),
+    ],
+)
+def test_inputs_that_are_invalid_are_errors(inputs, message):
+    with pytest.raises(ValueError, match=message):
+        command_for(time=0.5, **{"state": hover_state([0.0, 0.0, 0.0])} | inputs)
 
 
 @pytest.mark.parametrize("port", ["waypoint", "acceleration"])

@@ -18,11 +18,6 @@ SIDES = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])  # of our rotors along x 
 SPIN = np.array([1, -1, 1, -1])
 
 
-def fly_ours(params, commands, wind=None):
-    """Returns the states (n, 13) at the ends of commands (n, 4), from a hover."""
-    return fly(QuadrotorPlant(params), commands, wind=wind)
-
-
 def rotorpy_vehicle(params, abstraction, **aero):
     quad = {
         "mass": params.mass,
@@ -47,7 +42,7 @@ def rotorpy_vehicle(params, abstraction, **aero):
 
 
 def fly_rotorpy(vehicle, params, commands, wind=(0.0, 0.0, 0.0)):
-    """Integrates rotorpy's equations as `fly_ours`; `Multirotor.step` holds motor commands."""
+    """Integrates rotorpy's equations as `fly`; `Multirotor.step` holds motor commands."""
 
     def control(command, w):
         acceleration = (command[1:] - w) / params.rate_time_constant
@@ -90,7 +85,7 @@ def test_rotors_rates_and_air_are_rotorpys(commands):
     wind = [1.0, -2.0, 0.5]
     vehicle = rotorpy_vehicle(params, "cmd_ctbr")
     others = fly_rotorpy(vehicle, params, commands, wind)
-    states = fly_ours(params, commands, wind)
+    states = fly(QuadrotorPlant(params), commands, wind=wind)
     assert deviation(states, others) < 1e-3
     np.testing.assert_allclose(states[:, 3:], others[:, 3:], atol=1e-4)
     assert np.linalg.norm(states[-1, :3]) > 5.0
@@ -99,7 +94,7 @@ def test_rotors_rates_and_air_are_rotorpys(commands):
 def test_rotations_are_rotorpys_for_any_inertia(commands):
     vehicle = rotorpy_vehicle(KINGFISHER, "cmd_ctbm")
     others = fly_rotorpy(vehicle, KINGFISHER, commands)
-    assert deviation(fly_ours(KINGFISHER, commands), others) < 1e-3
+    assert deviation(fly(QuadrotorPlant(KINGFISHER), commands), others) < 1e-3
 
 
 def test_rotor_drag_equals_rotorpys_at_the_speed_of_hovering_only(commands):
@@ -110,14 +105,14 @@ def test_rotor_drag_equals_rotorpys_at_the_speed_of_hovering_only(commands):
     vehicle = rotorpy_vehicle(params, "cmd_ctbm", k_d=coefficient, k_z=coefficient)
     gentle = [9.81, 0.0, 0.0, 0.0] + 0.02 * (commands - [9.81, 0.0, 0.0, 0.0])
     for each, bounds in ((gentle, (0.0, 0.05)), (commands, (0.05, 2.0))):
-        apart = deviation(fly_ours(params, each), fly_rotorpy(vehicle, params, each))
+        apart = deviation(fly(QuadrotorPlant(params), each), fly_rotorpy(vehicle, params, each))
         assert bounds[0] <= apart < bounds[1]
 
 
 def test_saturated_rotors_give_up_yaw_first_and_rotorpys_do_not():
     commands = np.tile([9.81, 0.0, 0.0, 4.0], (10, 1))
     params = replace(KINGFISHER, yaw_time_ratio=0.4, max_thrust=12.0)
-    states = fly_ours(params, commands)
+    states = fly(QuadrotorPlant(params), commands)
     others = fly_rotorpy(rotorpy_vehicle(params, "cmd_ctbm"), params, commands)
     assert abs(states[:, 2]).max() < 1e-2 < abs(others[:, 2]).max()
 
@@ -127,7 +122,7 @@ def test_trajectories_are_crazyflows():
     # terms linear in the speed, rotors speed up and slow down differently, propellers have inertia.
     table = np.loadtxt(Path(__file__).parent / "crazyflow_trajectory.csv", delimiter=",")
     params = Crazyflie21Brushless()
-    states = fly_ours(params, table[:-1, 1:5])
+    states = fly(QuadrotorPlant(params), table[:-1, 1:5])
     assert deviation(states, table[1:, 5:]) < 1e-3
     np.testing.assert_allclose(states, table[1:, 5:], atol=1e-5)
     assert np.linalg.norm(states[-1, :3]) > 5.0

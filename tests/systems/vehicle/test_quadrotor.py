@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.symbolic import Evaluate, Expression, MakeVectorVariable, Variable
-from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
+from pydrake.systems.analysis import Simulator
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -24,10 +24,9 @@ from splatpilot.systems.vehicle.quadrotor import (
     torques,
 )
 from splatpilot.systems.vehicle.vehicles import Kingfisher
-from tests.systems.vehicle.responses import respond
+from tests.systems.vehicle.responses import fly, respond
 
 PARAMS = QuadrotorParams(drag=0.3, rate_time_constant=0.07, gravity=9.7)
-PERIOD = 0.02  # [s] of the commands and of the integration
 
 
 def random_states(rng, *shape):
@@ -138,16 +137,10 @@ def test_hover_state_is_level_at_rest_and_faces_yaw(yaw):
 
 
 def test_the_plant_agrees_with_rk4():
-    plant, x = QuadrotorPlant(), hover_state([0.0, 0.0, 0.0])
-    simulator = Simulator(plant)
-    ResetIntegratorFromFlags(simulator, "runge_kutta3", PERIOD)
-    simulator.get_mutable_integrator().set_fixed_step_mode(True)
-    context = simulator.get_mutable_context()
-    for k, command in enumerate(random_commands(np.random.default_rng(2), 100)):
-        plant.get_input_port().FixValue(context, command)
-        simulator.AdvanceTo((k + 1) * PERIOD)
-        x = rk4_step(x, command, QuadrotorParams(), PERIOD)
-    end = plant.GetOutputPort("state").Eval(context)
+    commands, x = random_commands(np.random.default_rng(2), 20), hover_state([0.0, 0.0, 0.0])
+    end = fly(QuadrotorPlant(), commands, 0.02)[-1]
+    for command in np.repeat(commands, 5, axis=0):
+        x = rk4_step(x, command, QuadrotorParams(), 0.02)
     assert np.linalg.norm(end[0:3] - x[0:3]) < 0.02
     assert np.linalg.norm(end[6:10]) == pytest.approx(1.0, abs=2e-4)
 
