@@ -21,7 +21,7 @@ from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size, num_hypotheses_in
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
-from splatpilot.systems.visualization.meshcat_drawing import draw_vehicle, vehicle_prefix
+from splatpilot.systems.visualization.meshcat_drawing import draw_vehicle, vehicle_path
 
 
 class Drawing(NamedTuple):
@@ -138,9 +138,9 @@ class FlightVisualizer(LeafSystem):
             path: `/splatpilot` by default, or `/splatpilot/NAME`.
             radius: of the vehicle [m].
         """
-        vehicle = vehicle_prefix(cast(System, state_port.get_system()), "plant")
-        name = name or "_".join([*([vehicle] if vehicle else []), "flight_visualizer"])
-        path = path or "/".join(["/splatpilot", *([vehicle] if vehicle else [])])
+        folder = vehicle_path(cast(System, state_port.get_system()), "plant")
+        name = name or "_".join([*folder.split("/")[2:], "flight_visualizer"])
+        path = path or folder
         count = num_hypotheses_in(hypotheses_port.size()) if hypotheses_port is not None else 0
         visualizer = FlightVisualizer(meshcat, count, draw=draw, path=path, radius=radius)
         inputs = [visualizer.get_input_port(k) for k in range(visualizer.num_input_ports())]
@@ -198,11 +198,8 @@ def hypothesis_colors(costs: np.ndarray) -> np.ndarray:
 
 
 def fan_mesh(plan: Hypotheses) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Makes horizontal ribbons along K hypotheses, from green (lowest cost) to red (highest).
-
-    Returns:
-        Vertices (3, V) [m], triangles (3, F) int32 seen from both sides, colors (3, V) in 0 to 1.
-    """
+    """Makes horizontal ribbons along K hypotheses, see `hypothesis_colors`: vertices (3, V) [m],
+    triangles (3, F) int32 seen from both sides, colors (3, V)."""
     K = len(plan.costs)
     start = np.broadcast_to(plan.X_WB.translation(), (K, 1, 3))
     path = np.concatenate([start, plan.waypoints_W], axis=1)  # (K, T + 1, 3)

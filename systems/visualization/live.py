@@ -15,7 +15,7 @@ from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.common.drake import add_slider, vector_output
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
-from splatpilot.systems.visualization.meshcat_drawing import draw_distance_slice, vehicle_prefix
+from splatpilot.systems.visualization.meshcat_drawing import draw_distance_slice, vehicle_path
 
 RESTART = "restart"
 """Message of the termination that the button for it causes."""
@@ -119,13 +119,14 @@ class LiveControls:
         radii = dict.fromkeys(self._goals, _HANDLE_RADIUS)
         self._handles = DragHandles(meshcat, radii | dict.fromkeys(self._vehicles, VEHICLE_RADIUS))
         self._grabbed: tuple[str, np.ndarray] | None = None
-        for name, key in ((PAUSE_BUTTON, "Space"), (STEP_BUTTON, "KeyN"), (RESTART_BUTTON, "KeyR")):
+        keys = {PAUSE_BUTTON: "Space", STEP_BUTTON: "KeyN", RESTART_BUTTON: "KeyR"}
+        for name, key in keys.items():
             meshcat.AddButton(name, key)
-        self._clicks: dict[str, int] = {PAUSE_BUTTON: 0, STEP_BUTTON: 0, RESTART_BUTTON: 0}
+        self._clicks = dict.fromkeys(keys, 0)
         add_slider(meshcat, RATE_SLIDER, (0.0, 4.0), 0.25, 1.0)
         self._rate = 1.0
         if field is not None:
-            lower, upper = float(np.asarray(field.lower_W)[2]), float(np.asarray(field.upper_W)[2])
+            lower, upper = float(field.lower_W[2]), float(field.upper_W[2])
             add_slider(meshcat, SLICE_SLIDER, (lower, upper), (upper - lower) / 50, lower)
             self._height = meshcat.GetSliderValue(SLICE_SLIDER)
         self.paused = False
@@ -195,28 +196,26 @@ class LiveControls:
         if rate != self._rate:
             self._rate = rate
             self._reset_clock(now)
-        self._draw_slice()
+        if self._field is not None:
+            self._draw_slice(self._field)
         self._drag(context)
 
-    def _draw_slice(self) -> None:
-        if self._field is None or self._meshcat.GetSliderValue(SLICE_SLIDER) == self._height:
+    def _draw_slice(self, field: DistanceField) -> None:
+        height, path = self._meshcat.GetSliderValue(SLICE_SLIDER), "/splatpilot/distance_slice"
+        if height == self._height:
             return
-        self._height, path = (
-            self._meshcat.GetSliderValue(SLICE_SLIDER),
-            "/splatpilot/distance_slice",
-        )
-        shown = self._height > float(np.asarray(self._field.lower_W)[2])
+        shown = height > field.lower_W[2]
         if shown:
-            draw_distance_slice(self._meshcat, path, self._field, self._height)
-        self._meshcat.SetProperty(path, "visible", shown)
+            draw_distance_slice(self._meshcat, path, field, height)
+        self._meshcat.SetProperty(path, "visible", bool(shown))
+        self._height = height
 
     def _drag(self, context: Context) -> None:
         """Moves the goals, and pushes the vehicles."""
         for name, goal in self._goals.items():
             p_WG = goal.get_source_value(goal.GetMyContextFromRoot(context)).value()
             self._handles.move(name, p_WG)
-            vehicle = [*filter(None, [vehicle_prefix(goal, "goal")])]
-            path = "/".join(["/splatpilot", *vehicle, "goal"])
+            path = f"{vehicle_path(goal, 'goal')}/goal"
             self._meshcat.SetTransform(path, RigidTransform(p_WG))
         for name, vehicle in self._vehicles.items():
             x = vector_output(vehicle, "state", vehicle.GetMyContextFromRoot(context))

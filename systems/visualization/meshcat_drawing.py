@@ -23,6 +23,7 @@ from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 from splatpilot.systems.collision.distance_field import DistanceField, FieldState
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
 from splatpilot.systems.collision.shapes import MovingSpheres
+from splatpilot.systems.splats.lens import pixel_slopes
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_parts
@@ -36,10 +37,8 @@ def draw_gaussians(
     upper_W: np.ndarray,
     max_points: int = 120_000,
 ) -> None:
-    """Draws the centers of the Gaussians in the box from lower_W to upper_W as colored points.
-
-    Points are thinned evenly, and have the size of the median Gaussian to close surfaces.
-    """
+    """Draws the centers of the Gaussians in the box from lower_W to upper_W as colored points,
+    thinned evenly, of the size of the median Gaussian."""
     inside = np.flatnonzero(np.all((scene.means >= lower_W) & (scene.means <= upper_W), axis=1))
     if len(inside) > max_points:
         inside = inside[np.linspace(0, len(inside) - 1, max_points).astype(int)]
@@ -73,19 +72,13 @@ def draw_goal(
     meshcat.SetTransform(path, RigidTransform(p_WG))
 
 
-def box_edges(lower_W: np.ndarray, upper_W: np.ndarray) -> np.ndarray:
-    """Returns the ends (12, 2, 3) [m] of the edges of a box from its corners (3,) [m]."""
-    corners = np.array(list(np.ndindex(2, 2, 2)))
-    starts, ends = np.nonzero(np.abs(corners[:, None] - corners).sum(axis=-1) == 1)
-    once = starts < ends
-    p_WQ = np.where(corners == 0, lower_W, upper_W)
-    return np.stack([p_WQ[starts[once]], p_WQ[ends[once]]], axis=1)
-
-
 def draw_box(meshcat: Meshcat, path: str, lower_W: np.ndarray, upper_W: np.ndarray) -> None:
     """Draws the edges of the box from lower_W (3,) to upper_W (3,) [m]."""
-    edges = box_edges(lower_W, upper_W)
-    meshcat.SetLineSegments(path, edges[:, 0].T, edges[:, 1].T, 1.0, Rgba(1.0, 1.0, 1.0))
+    corners = np.array(list(np.ndindex(2, 2, 2)))
+    steps = corners - corners[:, None]
+    starts, ends = np.nonzero((steps >= 0).all(axis=-1) & (steps.sum(axis=-1) == 1))
+    p_WQ = np.where(corners == 0, lower_W, upper_W)
+    meshcat.SetLineSegments(path, p_WQ[starts].T, p_WQ[ends].T, 1.0, Rgba(1.0, 1.0, 1.0))
 
 
 def draw_vehicle(meshcat: Meshcat, path: str, radius: float) -> None:
@@ -104,55 +97,30 @@ def distance_colors(distances: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(ramp, (0.5, 1), (1, 0)), 1 - np.abs(2 * ramp - 1), ramp**2], -1)
 
 
-def distance_slice(
-    field: DistanceField, height: float, spacing: float, max_distance: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Makes a mesh of the slice of a field at z = `height` [m], see `distance_colors`.
-
-    Unknown space is gray.
-
-    Args:
-        spacing: [m] between samples.
-        max_distance: [m] of the last color.
-
-    Returns:
-        Vertices p_WQ (N, 3) [m], faces (M, 3), visible from above, and colors (N, 3), 0 to 1.
-    """
-    lower_W, upper_W = np.asarray(field.lower_W), np.asarray(field.upper_W)
-    counts = np.maximum(2, np.ceil((upper_W[:2] - lower_W[:2]) / spacing).astype(int))
-    # A little inside, where every field has an answer.
-    margin = 1e-3 * (upper_W[:2] - lower_W[:2])
-    xs, ys = (
-        np.linspace(lower_W[i] + margin[i], upper_W[i] - margin[i], counts[i]) for i in range(2)
-    )
-    p_WQ = np.stack(np.meshgrid(xs, ys, [height], indexing="ij"), axis=-1).reshape(-1, 3)
-    sample = field.query(p_WQ)
-    colors = distance_colors(np.nan_to_num(sample.distance) / max_distance)
-    colors[sample.state >= FieldState.UNKNOWN] = UNKNOWN_GRAY
-
-    i, j = np.meshgrid(np.arange(counts[0] - 1), np.arange(counts[1] - 1), indexing="ij")
-    corner = (i * counts[1] + j).ravel()
-    faces = np.concatenate(
-        [
-            np.stack([corner, corner + counts[1], corner + 1], axis=-1),
-            np.stack([corner + 1, corner + counts[1], corner + counts[1] + 1], axis=-1),
-        ]
-    )
-    return p_WQ, faces.astype(np.int32), colors
-
-
 def draw_distance_slice(meshcat: Meshcat, path: str, field: DistanceField, height: float) -> None:
-    """Draws the `distance_slice` of a field at z = `height` [m], blue from 2 m on."""
-    area = np.prod((field.upper_W - field.lower_W)[:2])
-    spacing = max(0.2, math.sqrt(area / _SLICE_POINTS))
-    p_WQ, faces, colors = distance_slice(field, height, spacing, max_distance=2.0)
-    meshcat.SetTriangleColorMesh(path, p_WQ.T, faces.T, colors.T)
+    """Draws a slice of a field at z = `height` [m], visible from above: `distance_colors` of half
+    the distance, and unknown space gray."""
+    # A little inside, where every field has an answer.
+    lower, upper = np.asarray(field.lower_W)[:2], np.asarray(field.upper_W)[:2]
+    margin, spacing = 1e-3 * (upper - lower), math.sqrt(np.prod(upper - lower) / _SLICE_POINTS)
+    nx, ny = np.maximum(2, np.ceil((upper - lower) / max(0.2, spacing)).astype(int))
+    ends = np.transpose([lower + margin, upper - margin])
+    axes = [np.linspace(*pair, count) for pair, count in zip(ends, (nx, ny), strict=True)]
+    p_WQ = np.stack(np.meshgrid(*axes, [height], indexing="ij"), axis=-1).reshape(-1, 3)
+    sample = field.query(p_WQ)
+    colors = distance_colors(np.nan_to_num(sample.distance) / 2.0)
+    colors[sample.state >= FieldState.UNKNOWN] = UNKNOWN_GRAY
+    corner = np.arange(nx * ny).reshape(nx, ny)[:-1, :-1].ravel()
+    faces = [[corner, corner + ny, corner + 1], [corner + 1, corner + ny, corner + ny + 1]]
+    faces = np.concatenate(faces, axis=1).astype(np.int32)
+    meshcat.SetTriangleColorMesh(path, p_WQ.T, faces, colors.T)
 
 
-def vehicle_prefix(system: System, base: str) -> str:
-    """Returns the vehicle's name if the system is named `VEHICLE_base`, "" if it is `base`."""
+def vehicle_path(system: System, base: str) -> str:
+    """Returns `/splatpilot/VEHICLE` if the system is named `VEHICLE_base`, `/splatpilot` if it is
+    `base`."""
     name = system.get_name()
-    return "" if name == base else name.removesuffix(f"_{base}")
+    return "/splatpilot" if name == base else f"/splatpilot/{name.removesuffix(f'_{base}')}"
 
 
 _SLICE_POINTS = 40_000  # [-] of a slice, at most
@@ -160,20 +128,14 @@ _PICTURE_DEPTH = 0.6  # [m] from the camera to the shown image
 _DEPTH_POINTS = 10_000  # [-] at most
 
 
-def camera_rays(camera_info: CameraInfo, pixels: np.ndarray) -> np.ndarray:
-    """Returns the points (N, 3) of depth 1 at pixels (N, 2), frame C."""
-    homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
-    return homogeneous @ np.linalg.inv(camera_info.intrinsic_matrix()).T
-
-
 def draw_frustum(
     meshcat: Meshcat, path: str, camera_info: CameraInfo, X_BC: RigidTransform
 ) -> np.ndarray:
     """Draws the view frustum of a camera; returns its corners (4, 3) [m], frame C: top left, top
     right, bottom right, bottom left."""
-    width, height = camera_info.width(), camera_info.height()
-    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=float)
-    p_CCorners = _PICTURE_DEPTH * camera_rays(camera_info, corners)
+    corners = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], dtype=float)
+    corners *= [camera_info.width(), camera_info.height(), 1]  # [px], homogeneous
+    p_CCorners = _PICTURE_DEPTH * corners @ np.linalg.inv(camera_info.intrinsic_matrix()).T
     meshcat.SetTransform(path, X_BC)
     edges = np.stack([np.zeros((4, 3)), p_CCorners], axis=1).reshape(8, 3)
     meshcat.SetLine(f"{path}/frustum", edges.T, 2.0)
@@ -214,7 +176,7 @@ class CameraVisualizer(LeafSystem):
         super().__init__()
         self._meshcat, self._period, self._stride = meshcat, period, stride
         self._path, self._depth = path, depth
-        self._camera_info = camera_info
+        self._K = camera_info.intrinsic_matrix()
         self._p_CCorners = draw_frustum(meshcat, path, camera_info, X_BC)
         width, height = camera_info.width(), camera_info.height()
         self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U(width, height)))
@@ -242,8 +204,7 @@ class CameraVisualizer(LeafSystem):
             path: `/splatpilot/vehicle/camera` by default, `/splatpilot/NAME/vehicle/camera` if the
                 camera is named `NAME_camera`.
         """
-        vehicle = vehicle_prefix(camera, "camera")
-        path = path or "/".join(["/splatpilot", *([vehicle] if vehicle else []), "vehicle/camera"])
+        path = path or f"{vehicle_path(camera, 'camera')}/vehicle/camera"
         visualizer = CameraVisualizer(
             meshcat, camera.camera_info(), camera.X_BC(), period, depth=depth, path=path
         )
@@ -265,21 +226,15 @@ class CameraVisualizer(LeafSystem):
         self._meshcat.SetObject(f"{self._path}/picture", Mesh(InMemoryMesh(mesh_file=gltf)))
         send_picture(self._meshcat, self._path, rgb)
         if self._depth:
-            depth = cast(ImageDepth32F, self.GetInputPort("depth_image_32f").Eval(context))
-            self._draw_depth(rgb, np.asarray(depth.data)[..., 0])
+            image = cast(ImageDepth32F, self.GetInputPort("depth_image_32f").Eval(context))
+            depth = np.asarray(image.data)[..., 0]
+            step = int(np.ceil(np.sqrt(depth.size / _DEPTH_POINTS)))
+            slopes = pixel_slopes(None, self._K, *depth.shape[::-1])
+            z, slopes, colors = (array[::step, ::step] for array in (depth, slopes, rgb / 255))
+            valid = np.isfinite(z) & (z > 0)
+            p_CQ = z[valid, None] * np.insert(slopes[valid], 2, 1.0, axis=1)
+            draw_points(self._meshcat, f"{self._path}/depth", p_CQ, colors[valid], 0.03)
         return EventStatus.Succeeded()
-
-    def _draw_depth(self, rgb: np.ndarray, depth: np.ndarray) -> None:
-        step = int(np.ceil(np.sqrt(depth.size / _DEPTH_POINTS)))
-        rows, columns = (
-            index.ravel() for index in np.mgrid[: depth.shape[0] : step, : depth.shape[1] : step]
-        )
-        valid = np.isfinite(depth[rows, columns]) & (depth[rows, columns] > 0)
-        rows, columns = rows[valid], columns[valid]
-        p_CQ = depth[rows, columns, None] * camera_rays(
-            self._camera_info, np.column_stack([columns, rows]) + 0.5
-        )
-        draw_points(self._meshcat, f"{self._path}/depth", p_CQ, rgb[rows, columns] / 255, 0.03)
 
 
 def encode_jpeg(rgb: np.ndarray) -> bytes:
@@ -288,11 +243,8 @@ def encode_jpeg(rgb: np.ndarray) -> bytes:
 
 
 def send_picture(meshcat: Meshcat, path: str, rgb: np.ndarray) -> None:
-    """Sends an image (H, W, 3) to pages of `live_page`, as a property of a path in Meshcat.
-
-    Meshcat's properties are numbers: the first is the size of the JPEG file [bytes], and each
-    other holds six of its bytes, the lowest first.
-    """
+    """Sends an image (H, W, 3) to pages of `live_page`, as a property of a path: the size of the
+    JPEG file [bytes], then numbers of six of its bytes, the lowest first."""
     data = encode_jpeg(rgb)
     padded = np.frombuffer(data + bytes(-len(data) % 6), np.uint8).reshape(-1, 6)
     numbers = padded @ (256.0 ** np.arange(6))
@@ -333,40 +285,19 @@ _HIDDEN = np.array([0.0, 0.0, -1000.0])  # [m], of spheres that are absent
 
 
 class MovingSpheresVisualizer(LeafSystem):
-    """Draws moving spheres at the Context's time, sphere k at `PATH/k`; it has no ports."""
+    """Draws moving spheres at the Context's time, sphere k at `/splatpilot/spheres/k`; no ports."""
 
-    def __init__(
-        self,
-        meshcat: Meshcat,
-        spheres: MovingSpheres,
-        period: float = 1 / 15,
-        *,
-        path: str = "/splatpilot/spheres",
-    ):
+    def __init__(self, meshcat: Meshcat, spheres: MovingSpheres, period: float = 1 / 15):
         super().__init__()
-        self._meshcat, self._spheres, self._path = meshcat, spheres, path
+        self._meshcat, self._spheres = meshcat, spheres
         for k, radius in enumerate(spheres.radii):
-            meshcat.SetObject(f"{path}/{k}", Sphere(radius), Rgba(0.9, 0.75, 0.1))
+            meshcat.SetObject(f"/splatpilot/spheres/{k}", Sphere(radius), Rgba(0.9, 0.75, 0.1))
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
-
-    @staticmethod
-    def AddToBuilder(
-        builder: DiagramBuilder,
-        spheres: MovingSpheres,
-        meshcat: Meshcat,
-        *,
-        name: str = "spheres_visualizer",
-        path: str = "/splatpilot/spheres",
-    ) -> "MovingSpheresVisualizer":
-        """Adds a visualizer."""
-        visualizer = MovingSpheresVisualizer(meshcat, spheres, path=path)
-        builder.AddNamedSystem(name, visualizer)
-        return visualizer
 
     def _publish(self, context: Context) -> EventStatus:
         time = context.get_time()
         for k, center in enumerate(self._spheres.centers(time)):
             p_WO = center if np.isfinite(center).all() else _HIDDEN
-            self._meshcat.SetTransform(f"{self._path}/{k}", RigidTransform(p_WO), time)
+            self._meshcat.SetTransform(f"/splatpilot/spheres/{k}", RigidTransform(p_WO), time)
         return EventStatus.Succeeded()

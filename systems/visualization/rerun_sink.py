@@ -119,18 +119,16 @@ class RerunSink(LeafSystem):
         path: Path,
         ports: Mapping[str, OutputPort],
         *,
-        gaussians: GaussianScene | None = None,
-        goal: NDArray[np.float64] | None = None,
-        radius: float = VEHICLE_RADIUS,
         camera: SplatCamera | None = None,
-        period: float = 1 / 15,
         name: str = "rerun",
+        **options: Any,
     ) -> "RerunSink":
-        """Adds a sink that is connected to `ports`, and to the images of a camera."""
-        images = ("color_image", "depth_image_16u") if camera is not None else ()
-        ports = {**ports, **{image: camera.GetOutputPort(image) for image in images if camera}}
-        static = {"gaussians": gaussians, "goal": goal, "radius": radius}
-        sink = RerunSink(path, ports, **static, period=period)
+        """Adds a sink that is connected to `ports`, and to the images of a camera; for `options`
+        see the constructor."""
+        if camera is not None:
+            images = "color_image", "depth_image_16u"
+            ports = {**ports, **{image: camera.GetOutputPort(image) for image in images}}
+        sink = RerunSink(path, ports, **options)
         if camera is not None:
             sink.show_camera(camera.camera_info(), camera.X_BC())
         builder.AddNamedSystem(name, sink)
@@ -186,9 +184,10 @@ class RerunSink(LeafSystem):
     def _publish(self, context: Context) -> EventStatus:
         if self._recording is None:
             self._begin(context)
+        self._recording.set_time("time", duration=context.get_time())
         for k in range(self.num_input_ports()):
             port = self.get_input_port(k)
-            self._record(context, port.get_name(), port.Eval(context))
+            self._log[port.get_name()](port.Eval(context))
         return EventStatus.Succeeded()
 
     def _publish_outcome(self, context: Context) -> EventStatus:
@@ -196,10 +195,6 @@ class RerunSink(LeafSystem):
         if outcome == self._outcome:
             return EventStatus.DidNothing()
         return self._publish(context)
-
-    def _record(self, context: Context, name: str, value: Any) -> None:
-        self._recording.set_time("time", duration=context.get_time())
-        self._log[name](value)
 
     def _scalars(self, path: str, values: NDArray[np.float64]) -> None:
         self._recording.log(path, self._rr.Scalars(values))

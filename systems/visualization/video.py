@@ -29,8 +29,8 @@ class VideoRecorder(LeafSystem):
         name: VideoRecorder
         input_ports: [color_image, depth_image_16u]
 
-    Images are in a temporary file (0.4 MB each at 320x240), outside the Context, and are encoded
-    after the flight: one recorder is for one simulation at a time.
+    Images are in a temporary file (0.4 MB each at 320x240), outside the Context: one recorder is
+    for one simulation at a time.
     """
 
     def __init__(self, width: int, height: int, fps: float):
@@ -50,16 +50,13 @@ class VideoRecorder(LeafSystem):
     def AddToBuilder(
         builder: DiagramBuilder, camera: SplatCamera, fps: float, *, name: str = ""
     ) -> "VideoRecorder":
-        """Adds a recorder of a camera, named `video` if that is named `camera`, else its name and
-        `_video`."""
+        """Adds a recorder of a camera, named `video`, or `NAME_video` of another than `camera`."""
         info = camera.camera_info()
         recorder = VideoRecorder(info.width(), info.height(), fps)
         default = "video" if camera.get_name() == "camera" else f"{camera.get_name()}_video"
         builder.AddNamedSystem(name or default, recorder)
-        builder.Connect(camera.GetOutputPort("color_image"), recorder.GetInputPort("color_image"))
-        builder.Connect(
-            camera.GetOutputPort("depth_image_16u"), recorder.GetInputPort("depth_image_16u")
-        )
+        for port in ("color_image", "depth_image_16u"):
+            builder.Connect(camera.GetOutputPort(port), recorder.GetInputPort(port))
         return recorder
 
     def _clear(self, context: Context) -> EventStatus:
@@ -86,11 +83,8 @@ class VideoRecorder(LeafSystem):
         return EventStatus.Succeeded()
 
     def frames(self, max_depth: float) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
-        """Yields the images of color and of depth, (H, W, 3) each in OpenCV's channel order.
-
-        Args:
-            max_depth: [m], see `colorize_depth`.
-        """
+        """Yields the images of color and of depth, see `colorize_depth`, (H, W, 3) each in OpenCV's
+        channel order."""
         size = self._frame.itemsize
         for k in range(self._count):
             frame = np.frombuffer(os.pread(self._file.fileno(), size, k * size), self._frame)[0]
@@ -99,21 +93,12 @@ class VideoRecorder(LeafSystem):
 
     def save(self, path: Path, max_depth: float) -> None:
         """Writes the video (H.264 in MP4) atomically; `max_depth` as in `frames`."""
-        with written_atomically(path, self._check) as partial:
-            self._encode(partial, max_depth)
-
-    def _check(self, path: Path) -> None:
-        """Raises OSError if a video is incomplete: its writer ignores full disks."""
-        recorded = self._count
-        with av.open(str(path)) as container:
-            found = sum(packet.size > 0 for packet in container.demux(video=0))
-        if found != recorded:
-            raise OSError(f"only {found} of {recorded} images are written")
-
-    def _encode(self, path: Path, max_depth: float) -> None:
         height, width = self._frame["depth"].shape
         odd = height % 2  # Players need even sizes.
-        with av.open(str(path), "w") as container:
+        with (
+            written_atomically(path, self._check) as partial,
+            av.open(str(partial), "w") as container,
+        ):
             rate = Fraction(self._fps).limit_denominator(1000)
             stream = container.add_stream("libx264", rate, {"preset": "ultrafast", "crf": "20"})
             stream.width, stream.height, stream.pix_fmt = 2 * width, height + odd, "yuv420p"
@@ -121,6 +106,13 @@ class VideoRecorder(LeafSystem):
                 picture = np.pad(np.hstack(pictures), ((0, odd), (0, 0), (0, 0)))
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "bgr24")))
             container.mux(stream.encode())
+
+    def _check(self, path: Path) -> None:
+        """Raises OSError if a video is incomplete: its writer ignores full disks."""
+        with av.open(str(path)) as container:
+            found = sum(packet.size > 0 for packet in container.demux(video=0))
+        if found != self._count:
+            raise OSError(f"only {found} of {self._count} images are written")
 
 
 def colorize_depth(depth: np.ndarray, max_depth: float) -> np.ndarray:

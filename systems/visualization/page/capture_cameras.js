@@ -4,7 +4,6 @@
 class CaptureCameras {
   // `cameras`: {size, slope_x, slope_y, fov_y, poses, names, images}, see `pages.scene_page`.
   constructor(viewer, cameras) {
-    const THREE = MeshCat.THREE;
     Object.assign(this, cameras);
     this.viewer = viewer;
     this.poses = cameras.poses.map((pose) => new THREE.Matrix4().fromArray(pose).transpose());
@@ -26,7 +25,7 @@ class CaptureCameras {
   }
 
   outline(poses) {
-    const THREE = MeshCat.THREE, {size, slope_x, slope_y} = this, points = [];
+    const {size, slope_x, slope_y} = this, points = [];
     const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(
       ([x, y]) => new THREE.Vector3(x * slope_x * size, y * slope_y * size, size));
     for (const pose of poses) {
@@ -39,7 +38,6 @@ class CaptureCameras {
 
   // The camera whose frustum is on the screen at x, y in the window [px], or null.
   at(x, y) {
-    const THREE = MeshCat.THREE;
     let nearest = 18, found = null;
     this.poses.forEach((pose, k) => {
       const p = new THREE.Vector3(0, 0, 0.6 * this.size).applyMatrix4(pose);
@@ -52,7 +50,6 @@ class CaptureCameras {
   }
 
   choose(k) {
-    const THREE = MeshCat.THREE;
     this.chosen = k;
     this.outlined.visible = k !== null;
     this.picture.visible = false;

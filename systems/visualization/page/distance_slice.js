@@ -5,7 +5,7 @@ class DistanceSlice {
   // `grid` of `pages.scene_page`, and its values: x the fastest, then y, then z; 255 in
   // unobserved space.
   constructor(grid, values) {
-    const THREE = MeshCat.THREE, [nx, ny] = grid.shape, edge = grid.voxel_size;
+    const [nx, ny] = grid.shape, edge = grid.voxel_size;
     Object.assign(this, grid, {values});
     this.texture = new THREE.DataTexture(new Uint8Array(4 * nx * ny), nx, ny);
     this.texture.colorSpace = THREE.SRGBColorSpace;

@@ -4,7 +4,6 @@
 // `url`: of Meshcat's web socket. Gaussians above a height, at first `cut`, are left out; the slider
 // goes from `lower` to `upper` [m].
 function showLive(splats, {name, url, lower, upper, cut, fov_y}) {
-  const THREE = MeshCat.THREE;
   // Meshcat's points of the same Gaussians.
   viewer.set_property(["splatpilot", "scene"], "visible", false);
   // Meshcat's messages about the background do not replace the sky.
@@ -68,11 +67,11 @@ function unlight(mesh) {
   if (mesh.material?.type !== "MeshPhongMaterial" || !mesh.material.vertexColors) return;
   const {transparent, opacity, visible} = mesh.material, {color} = mesh.geometry.attributes;
   for (let i = 0; i < color.count; ++i) {
-    const linear = new MeshCat.THREE.Color().fromBufferAttribute(color, i).convertSRGBToLinear();
+    const linear = new THREE.Color().fromBufferAttribute(color, i).convertSRGBToLinear();
     color.setXYZ(i, linear.r, linear.g, linear.b);
   }
-  mesh.material = new MeshCat.THREE.MeshBasicMaterial(
-    {vertexColors: true, side: MeshCat.THREE.DoubleSide, transparent, opacity, visible});
+  mesh.material = new THREE.MeshBasicMaterial(
+    {vertexColors: true, side: THREE.DoubleSide, transparent, opacity, visible});
 }
 
 // The bytes of a picture, six in each number, the lowest first; the first number is their count.

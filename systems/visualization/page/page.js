@@ -17,7 +17,6 @@ function unpack(id) {
 function showSky() {
   const picture = document.getElementById("sky").textContent;
   if (!picture) return;
-  const THREE = MeshCat.THREE;
   new THREE.TextureLoader().load(`data:image/png;base64,${picture}`, (texture) => {
     texture.mapping = THREE.EquirectangularReflectionMapping;
     texture.colorSpace = THREE.SRGBColorSpace;
@@ -137,7 +136,6 @@ class Views {
 
 // The pose that looks from `eye` at `target`, both in W.
 function lookAt(eye, target) {
-  const THREE = MeshCat.THREE;
   return new THREE.Matrix4().lookAt(eye, target, new THREE.Vector3(0, 0, 1)).setPosition(eye);
 }
 

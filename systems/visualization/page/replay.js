@@ -7,7 +7,6 @@
 
 class Replay {
   constructor(viewer, splats, data) {
-    const THREE = MeshCat.THREE;
     Object.assign(this, data);
     this.viewer = viewer;
     this.splats = splats;
@@ -156,12 +155,12 @@ class Replay {
 
   onboardPose() {
     return this.chosen.pose(this.time).multiply(this.X_BC)
-      .multiply(new MeshCat.THREE.Matrix4().makeScale(1, -1, -1));
+      .multiply(new THREE.Matrix4().makeScale(1, -1, -1));
   }
 
   // It follows the vehicle along its own path, 2 m behind, so that no obstacle is between.
   chasePose() {
-    const THREE = MeshCat.THREE, flight = this.chosen, {i, j, s} = flight.at(this.time);
+    const flight = this.chosen, {i, j, s} = flight.at(this.time);
     const flown = lerp(flight.lengths[i], flight.lengths[j], s);
     const p = flight.position(this.time), eye = flight.positionAt(flown - 2);
     const ahead = flight.position(this.time + 0.5).sub(eye).setZ(0);

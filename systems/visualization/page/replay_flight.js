@@ -6,7 +6,6 @@ const lerp = (a, b, s) => a + (b - a) * s;
 // One flight's samples, plans and pictures.
 class ReplayFlight {
   constructor(data, k, replay) {
-    const THREE = MeshCat.THREE;
     Object.assign(this, data);
     this.vehicle = replay.viewer.scene_tree.find(["splatpilot", "vehicles", `${k}`]).object;
     this.vehicle.matrixAutoUpdate = false;
@@ -66,7 +65,7 @@ class ReplayFlight {
   }
 
   pose(time) {
-    const THREE = MeshCat.THREE, {i, j, s} = this.at(time);
+    const {i, j, s} = this.at(time);
     return new THREE.Matrix4().compose(
       this.points[i].clone().lerp(this.points[j], s),
       this.rotations[i].clone().slerp(this.rotations[j], s), new THREE.Vector3(1, 1, 1));
@@ -100,7 +99,6 @@ class ReplayFlight {
   // All hypotheses of a plan as one mesh of level ribbons, from green (lowest cost) to red (highest),
   // except for parts nearer than `nearest` [m] to `eye` and would cover the view.
   showPlan(index, eye, nearest) {
-    const THREE = MeshCat.THREE;
     this.fan.visible = index >= 0 && this.chosen;
     if (index < 0 || (index === this.shownPlan && !nearest && !this.shownNearest)) return;
     this.shownPlan = index;
@@ -142,7 +140,6 @@ class ReplayFlight {
 // Moving spheres; those with centers of nulls are hidden.
 class ReplaySpheres {
   constructor({period, radii, centers}) {
-    const THREE = MeshCat.THREE;
     Object.assign(this, {period, radii, centers});
     this.mesh = new THREE.InstancedMesh(
       new THREE.SphereGeometry(1, 24, 12), new THREE.MeshLambertMaterial({color: 0xe6bf1a}),
@@ -151,7 +148,7 @@ class ReplaySpheres {
   }
 
   show(time) {
-    const THREE = MeshCat.THREE, last = this.centers.length - 1;
+    const last = this.centers.length - 1;
     const index = Math.min(Math.floor(time / this.period), last);
     const share = Math.min(time / this.period - index, 1);
     const before = this.centers[index], after = this.centers[Math.min(index + 1, last)];

@@ -4,7 +4,7 @@
 class Ruler {
   // `unit`: of lengths.
   constructor(viewer, unit) {
-    const THREE = MeshCat.THREE, color = 0xc81e5a;
+    const color = 0xc81e5a;
     Object.assign(this, {viewer, unit, points: []});
     // Drawn over everything, so that the ends are seen from wherever one looks.
     const over = {color, depthTest: false, transparent: true};
@@ -32,7 +32,7 @@ class Ruler {
   }
 
   set(points) {
-    const THREE = MeshCat.THREE, [a, b] = points.map((p) => new THREE.Vector3(...p));
+    const [a, b] = points.map((p) => new THREE.Vector3(...p));
     this.points = points;
     this.group.visible = points.length > 0;
     this.line.visible = points.length === 2;

@@ -46,7 +46,7 @@ class SceneView {
     });
     pane.addEventListener("dblclick", (event) => {
       const point = !this.ruling && this.surfaceAt(event.clientX, event.clientY);
-      if (point) this.turnAbout(new MeshCat.THREE.Vector3(...point));
+      if (point) this.turnAbout(new THREE.Vector3(...point));
     });
   }
 
@@ -158,7 +158,7 @@ class SceneView {
 
   // The point of W on the surface seen at x, y in the window [px], or null.
   surfaceAt(x, y) {
-    const THREE = MeshCat.THREE, {camera, scene} = this.viewer;
+    const {camera, scene} = this.viewer;
     const eye = scene.worldToLocal(new THREE.Vector3().setFromMatrixPosition(camera.matrixWorld));
     const toward = (u, v) => scene.worldToLocal(new THREE.Vector3(u, v, 0.5).unproject(camera))
       .sub(eye).normalize().toArray();
@@ -169,7 +169,7 @@ class SceneView {
 
   // The whole scene from above, as near as it fits into the window.
   look() {
-    const THREE = MeshCat.THREE, {lower, upper} = this.data, {camera, scene} = this.viewer;
+    const {lower, upper} = this.data, {camera, scene} = this.viewer;
     const toward = new THREE.Vector3(...this.data.toward).normalize();
     const target = new THREE.Vector3(...lower).lerp(new THREE.Vector3(...upper), 0.5)
       .setZ(Math.min(this.height, upper[2]));
@@ -194,7 +194,7 @@ class SceneView {
   // Through the camera of the chosen image; the mouse leads away from there.
   lookFromCamera() {
     const {poses, chosen, fov_y} = this.cameras;
-    this.pose = poses[chosen].clone().multiply(new MeshCat.THREE.Matrix4().makeScale(1, -1, -1));
+    this.pose = poses[chosen].clone().multiply(new THREE.Matrix4().makeScale(1, -1, -1));
     this.viewer.controls.enabled = false;
     this.viewer.camera.fov = fov_y;
     this.viewer.camera.clearViewOffset();
@@ -206,7 +206,7 @@ class SceneView {
 
   leavePose() {
     if (!this.pose) return;
-    const ahead = new MeshCat.THREE.Vector3(0, 0, -1).applyMatrix4(this.pose);
+    const ahead = new THREE.Vector3(0, 0, -1).applyMatrix4(this.pose);
     this.pose = null;
     this.viewer.controls.enabled = true;
     this.showDrawn(true);

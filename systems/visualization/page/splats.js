@@ -8,7 +8,6 @@
 class Splats {
   // `packed`: Uint32Array, 8 words each, as `pack_gaussians` writes them.
   constructor(viewer, packed) {
-    const THREE = MeshCat.THREE;
     this.viewer = viewer;
     this.packed = packed;
     this.floats = new Float32Array(packed.buffer, packed.byteOffset, packed.length);

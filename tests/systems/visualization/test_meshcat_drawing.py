@@ -99,7 +99,7 @@ def test_visualizers_of_two_vehicles_draw_by_forced_publish(meshcat):
         CameraVisualizer.AddToBuilder(builder, camera, meshcat, depth=True)
         VideoRecorder.AddToBuilder(builder, camera, 15.0)
     spheres = MovingSpheres([0.5], [np.array([[float(k), 0, 1] for k in range(20)])], 0.1)
-    MovingSpheresVisualizer.AddToBuilder(builder, spheres, meshcat)
+    builder.AddSystem(MovingSpheresVisualizer(meshcat, spheres))
     diagram = builder.Build()
     assert diagram.HasSubsystemNamed("b_flight_visualizer") and diagram.HasSubsystemNamed("video")
     context = diagram.CreateDefaultContext()
