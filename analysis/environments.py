@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import batched
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -252,7 +253,8 @@ def show(*, scenes: Path) -> list[Record]:
 
 
 def _row(record: Record) -> dict[str, str]:
-    values = asdict(record) | {"size": " x ".join(f"{length:.0f}" for length in record.size)}
+    values: dict[str, Any] = asdict(record)
+    values["size"] = " x ".join(f"{length:.0f}" for length in record.size)
     cells = {title: format_metric(values[name], form) for name, (title, form) in _TABLE.items()}
     return {"environment": record.name} | cells
 

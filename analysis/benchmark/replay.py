@@ -37,6 +37,8 @@ from splatpilot.systems.visualization.pages import ReplayedFlight
 from splatpilot.systems.visualization.rerun_sink import RerunSink
 from splatpilot.systems.visualization.video import VideoRecorder
 
+_LOGS = "times", "states", "clearances"
+
 
 def run(
     *,
@@ -111,8 +113,9 @@ def overlay(
                 f"{spec.id} flew another world than {first.id}; name flights of one scenario and "
                 "seed"
             )
-        logs = (arrays[name].astype(float) for name in ("times", "states", "clearances"))
-        flights.append(ReplayedFlight(spec.id, row["outcome"], *logs, np.empty((0, 0))))
+        times, states, clearances = (arrays[name].astype(float) for name in _LOGS)
+        no_plans = np.empty((0, 0))
+        flights.append(ReplayedFlight(spec.id, row["outcome"], times, states, clearances, no_plans))
     scenario = sample_scenario(next(kept_flights(folder, [first]))[1])
     out = out or study / "replays" / first.id
     page = out / "flights.html"

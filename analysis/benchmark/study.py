@@ -202,8 +202,9 @@ def own_speeds(config: StudyConfig) -> list[float]:
         return []
     files = {scenario_file(variant.scenario) for variant in config.scenario_variants}
     first, *others = [policy_speed(load_config(Scenario(), file).policy) for file in files]
-    is_one = isinstance(first, float) and all(speed == first for speed in others)
-    return [first] if is_one else []
+    if isinstance(first, float) and all(speed == first for speed in others):
+        return [first]
+    return []
 
 
 def _check_overrides(overrides: Iterable[str], where: str) -> None:

@@ -223,10 +223,9 @@ def success_summary(rows: list[Row], bases: Mapping[str, str] | None = None) -> 
         bases: names of the scenarios without changed fields, by those of their variants.
     """
     wins, flights = _count(rows, lambda row: row["scenario"])
-    named = dict(bases or {})
-    clusters = cluster_interval(
-        *_count(rows, lambda row: named.get(row["scenario"], row["scenario"]))
-    )
+    named: dict[Any, str] = dict(bases or {})
+    bootstrapped = _count(rows, lambda row: named.get(row["scenario"]) or row["scenario"])
+    clusters = cluster_interval(*bootstrapped)
     return (
         _success(sum(wins), len(rows), effective_flights(*_count(rows, _world)))
         | {"cluster_lower": clusters.lower, "cluster_upper": clusters.upper}
