@@ -6,6 +6,7 @@ import logging
 import math
 import socket
 import struct
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -203,37 +204,27 @@ class Relay:
         """Applies a fault to a message; returns delays [s] and contents of its copies."""
         random, is_on, unchanged = self._random, fault.is_on(self._now), [(0.0, data)]
         is_affected = codec.port == _PORTS.get(fault.kind, codec.port)
-
-        def edited(edit: Callable[[Any], object]) -> list[tuple[float, bytes]]:
-            message = codec.message.decode(data)
-            edit(message)
-            return [(0.0, message.encode())]
-
         if fault.kind == "clock_jump" and from_vehicle and codec.port != "depth_grid":
             jump = round(fault.size * 1e6) if self._now >= fault.begin else 0  # [us]
-            return edited(lambda m: setattr(m.header, "utime", m.header.utime + jump))
-        if fault.kind == "state_frozen" and is_affected:
             message = codec.message.decode(data)
+            message.header.utime += jump
+            return [(0.0, message.encode())]
+        if fault.kind == "state_frozen" and is_affected:
             self._state = (self._state or data) if is_on else None
-            frozen = codec.message.decode(self._state or data)
-            frozen.header = message.header
-            return [(0.0, frozen.encode())]
+            return _edited(codec, self._state or data, header=codec.message.decode(data).header)
         if not is_on:
             return unchanged
         if fault.kind == "state_jumped" and is_affected:
             jump = math.copysign(1.0 + 2.0 * fault.fraction, fault.size)  # [m]
-            return edited(lambda m: setattr(m, "p_WB", np.add(m.p_WB, [0.0, jump, 0.0])))
+            p_WB = np.add(codec.message.decode(data).p_WB, [0.0, jump, 0.0])
+            return _edited(codec, data, p_WB=p_WB)
         if fault.kind == "heading_jumped" and is_affected:
             angle = math.copysign(0.5 + 2.0 * fault.fraction, fault.size)  # [rad]
-            turn = Rotation.from_euler("z", angle)
-            return edited(
-                lambda m: setattr(
-                    m, "q_WB", _quaternion(turn * Rotation.from_quat(m.q_WB, scalar_first=True))
-                )
-            )
+            R_WB = Rotation.from_quat(codec.message.decode(data).q_WB, scalar_first=True)
+            return _edited(codec, data, q_WB=_quaternion(Rotation.from_euler("z", angle) * R_WB))
         if fault.kind == "offboard_left":  # The autopilot follows no command any more.
             if codec.port == "vehicle_status":
-                return edited(lambda m: setattr(m, "offboard", False))
+                return _edited(codec, data, offboard=False)
             return unchanged if from_vehicle else []
         if fault.kind in ("slow", "state_slow") and is_affected:
             key = fault, codec.channel
@@ -254,14 +245,10 @@ class Relay:
                 return [(float(random.uniform(0.0, DELAY)), data)]
             case "state_garbage":
                 p_WB, v_WB = random.normal(scale=10 ** random.uniform(0.0, 4.0), size=(2, 3))
-                values = {
-                    "p_WB": p_WB,
-                    "v_WB": v_WB,
-                    "q_WB": _quaternion(Rotation.random(rng=random)),
-                }
-                return edited(lambda m: [setattr(m, *each) for each in values.items()])
+                q_WB = _quaternion(Rotation.random(rng=random))
+                return _edited(codec, data, p_WB=p_WB, v_WB=v_WB, q_WB=q_WB)
             case "body_lost":
-                return edited(lambda m: setattr(m, "tracked", False))
+                return _edited(codec, data, tracked=False)
             case "corrupt" | "grid_corrupt":
                 broken = bytearray(data[: random.integers(0, len(data) + 1)])
                 for index in random.integers(0, max(len(broken), 1), 8) if broken else ():
@@ -271,6 +258,14 @@ class Relay:
                 at = 8 * int(random.integers(1, max(len(data) // 8, 2))) - 4
                 return [(0.0, data[:at] + struct.pack(">d", math.nan) + data[at + 8 :])]
         return unchanged
+
+
+def _edited(codec: codecs.Codec, data: bytes, **fields: Any) -> list[tuple[float, bytes]]:
+    """Returns a message, without delay, with other values of some fields."""
+    message = codec.message.decode(data)
+    for name, value in fields.items():
+        setattr(message, name, value)
+    return [(0.0, message.encode())]
 
 
 def _quaternion(rotation: Rotation) -> list[float]:
@@ -289,10 +284,10 @@ class Nonsense(LeafSystem):
     def _calc(self, context: Context, output: BasicVector) -> None:
         decision = np.array(vector_input(self, "sense", context))
         start = HEADER_SIZE if len(decision) > HEADER_SIZE else 0  # hypotheses without time: none
-        for fault in self._faults:
-            if fault.kind == "policy_raises" and fault.is_on(context.get_time()):
+        for fault in (each for each in self._faults if each.is_on(context.get_time())):
+            if fault.kind == "policy_raises":
                 raise RuntimeError("the policy fails")
-            if fault.kind == "policy_nonsense" and fault.is_on(context.get_time()):
+            if fault.kind == "policy_nonsense":
                 decision[start:] = 1e6 if fault.fraction > 0.65 else np.nan
         output.SetFromVector(decision)
 
@@ -343,9 +338,7 @@ def fly_trial(
     relay = Relay(near, far, sent, commands, faults, np.random.default_rng(seed), grid_port)
     vehicle_simulator, bridge_simulator = Simulator(vehicle), Simulator(bridge)
     ApplySimulatorConfig(scenario.simulator, vehicle_simulator)
-    root, bridge_root = (
-        simulator.get_mutable_context() for simulator in (vehicle_simulator, bridge_simulator)
-    )
+    root, bridge_root = (s.get_mutable_context() for s in (vehicle_simulator, bridge_simulator))
     plant = vehicle.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
     set_state(plant, sample_initial_state(scenario, world))
     autopilot = vehicle.GetSubsystemByName("failsafe")
@@ -376,8 +369,7 @@ def fly_trial(
         if has_landed(vehicle, root):
             outcome = Outcome.LANDED
             break
-        autopilot_context = autopilot.GetMyContextFromRoot(root)
-        own_mode = vector_output(autopilot, "mode", autopilot_context)[0]
+        own_mode = vector_output(autopilot, "mode", autopilot.GetMyContextFromRoot(root))[0]
         if status.LANDING not in (mode, own_mode):
             min_clearance = min(min_clearance, float(vector_output(vehicle, "clearance", root)[0]))
             to_fence = np.min([state.p_WB - lower_W, upper_W - state.p_WB])
@@ -456,13 +448,11 @@ def run(*, config: FaultsConfig, out: Path, jobs: int | None = None) -> dict[str
     for row in rows if missing else ():
         before, remedy = row.get("revision"), "go back to that revision, or choose another --out"
         require(before == flown_by, f"revision of {lines}", flown_by, before, remedy)
-    bar = Progress(total=config.trials, initial=len(rows), desc="flying trials", unit="trial")
-    with bar:
-        for row in map_processes(partial(_fly, config), missing, jobs):
-            rows.append({"revision": flown_by} | row)
-            rows.sort(key=itemgetter("seed"))
-            write_text(lines, "".join(json.dumps(row) + "\n" for row in rows))
-            bar.update()
+    flights = map_processes(partial(_fly, config), missing, jobs)
+    for row in Progress(flights, "flying trials", config.trials, initial=len(rows), unit="trial"):
+        rows.append({"revision": flown_by} | row)
+        rows.sort(key=itemgetter("seed"))
+        write_text(lines, "".join(json.dumps(row) + "\n" for row in rows))
     summary = summarize(rows, _TABLES[config.table])
     write_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")
     print(f"{'fault':<16} {'safe':>9}  ended")
@@ -480,16 +470,12 @@ def _fly(config: FaultsConfig, number: int) -> dict[str, Any]:
     trial = Trial.sample(number, random, _TABLES[config.table])
     policy = policy_named(trial.policy, config.speed)
     scenario = replace(config.scenario, seed=seed, policy=policy)
-    # Thousands of packets are refused, and policies raise, on purpose.
-    loggers = [logging.getLogger(name) for name in ("drake", "splatpilot")]
-    levels = [logger.level for logger in loggers]
+    level = logging.root.manager.disable
+    logging.disable(logging.ERROR)  # Packets are refused, and policies raise, on purpose.
     try:
-        for logger in loggers:
-            logger.setLevel(logging.CRITICAL)
         return fly_trial(scenario, world, trial, config.limits, seed)
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        logging.disable(level)
 
 
 def summarize(rows: list[dict[str, Any]], table: tuple[str, ...] = KINDS) -> dict[str, Any]:
@@ -497,10 +483,9 @@ def summarize(rows: list[dict[str, Any]], table: tuple[str, ...] = KINDS) -> dic
     kinds = {}
     for kind in table:
         of_kind = [row for row in rows if kind in {fault["kind"] for fault in row["faults"]}]
-        ends = [row["outcome"] for row in of_kind]
         kinds[kind] = {
             "trials": len(of_kind),
             "safe": sum(row["safe"] for row in of_kind),
-            "outcomes": {end: ends.count(end) for end in sorted(set(ends))},
+            "outcomes": dict(sorted(Counter(row["outcome"] for row in of_kind).items())),
         }
     return {"trials": len(rows), "safe": sum(row["safe"] for row in rows), "kinds": kinds}
