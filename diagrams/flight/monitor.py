@@ -68,6 +68,14 @@ def _end(
     return margin, next(end for end, m in zip(ENDS, margins, strict=True) if m <= 0)
 
 
+def _declare_outcome(system: Any, timeout: float) -> None:
+    """Declares the port and the events of the outcome of a flight."""
+    calc = weak_callback(system._calc_outcome)
+    system.DeclareAbstractOutputPort("outcome", lambda: Value(""), calc)
+    system.DeclarePerStepPublishEvent(system._check)
+    system.DeclarePeriodicPublishEvent(timeout, timeout, system._check)
+
+
 class FlightMonitor(LeafSystem):
     """Ends a flight at a collision, outside the known volume, at the goal, or at its timeout.
 
@@ -93,9 +101,7 @@ class FlightMonitor(LeafSystem):
         self.scenario, self.world = copy.deepcopy(scenario), world
         for name, size in {"state": 13, "goal": 3, "clearance": 1, "field_state": 1}.items():
             self.DeclareVectorInputPort(name, size)
-        self.DeclareAbstractOutputPort(
-            "outcome", lambda: Value(""), weak_callback(self._calc_outcome)
-        )
+        _declare_outcome(self, scenario.timeout)
         calc = weak_callback(self._calc_end)
         self._end_index = self.DeclareCacheEntry(
             "end", ValueProducer(lambda: Value(object), calc), {self.all_input_ports_ticket()}
@@ -107,8 +113,6 @@ class FlightMonitor(LeafSystem):
             WitnessFunctionDirection.kPositiveThenNonPositive,
             weak_callback(self._margin),
         )
-        self.DeclarePerStepPublishEvent(self._check)
-        self.DeclarePeriodicPublishEvent(scenario.timeout, scenario.timeout, self._check)
 
     def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
         # Drake cannot isolate the instant without an accuracy.
@@ -161,12 +165,7 @@ class _MonitorByValues(ByValues):
 
     def __init__(self, monitor: FlightMonitor) -> None:
         super().__init__(monitor)
-        self.DeclareAbstractOutputPort(
-            "outcome", lambda: Value(""), weak_callback(self._calc_outcome)
-        )
-        timeout = monitor.scenario.timeout
-        self.DeclarePerStepPublishEvent(self._check)
-        self.DeclarePeriodicPublishEvent(timeout, timeout, self._check)
+        _declare_outcome(self, monitor.scenario.timeout)
 
     def _calc_outcome(self, context, output):
         self._system._calc_outcome(self.context_of_values(context), output)

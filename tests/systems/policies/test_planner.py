@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydrake.math import RollPitchYaw
+from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
@@ -12,7 +12,11 @@ from splatpilot.systems.policies.hypotheses import HypothesisSelector
 from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.policies.planner import PrivilegedPlanner, PrivilegedPlannerConfig, plan
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
-from splatpilot.systems.vehicle.flatness import FlatnessController, FlatnessControllerConfig
+from splatpilot.systems.vehicle.flatness import (
+    FlatnessController,
+    FlatnessControllerConfig,
+    attitude_from_thrust,
+)
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant, hover_state
 
 MARGIN = LatticeConfig().margin
@@ -22,11 +26,8 @@ def flying(p_WB, v_WB, a_WB=(0.0, 0.0, 0.0)):
     state = hover_state(p_WB)
     state[3:6] = v_WB
     thrust_W = np.array([a_WB[0] + 0.375 * v_WB[0], a_WB[1] + 0.375 * v_WB[1], 9.81])
-    axis_angle = np.cross([0, 0, 1], thrust_W / np.linalg.norm(thrust_W))
-    angle = np.arcsin(np.linalg.norm(axis_angle))
-    if angle > 0.0:
-        axis = axis_angle / np.linalg.norm(axis_angle)
-        state[6:10] = [np.cos(angle / 2), *(np.sin(angle / 2) * axis)]
+    R_WB = RotationMatrix(attitude_from_thrust(thrust_W, 0.0))
+    state[6:10] = R_WB.ToQuaternion().wxyz()
     return state
 
 
