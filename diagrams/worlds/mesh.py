@@ -139,28 +139,33 @@ def sample_colors(
             points, face, weights = drawn
             colors = _base_colors(mesh, face, weights)
             mode = getattr(getattr(mesh.visual, "material", None), "alphaMode", None)
-            seen = (colors[:, 3] >= 255 * _CUTOFF) | (mode not in ("MASK", "BLEND"))
-            linear = (colors[:, :3] / 255.0) ** GAMMA
-            sampled = scale * points @ R_WM.T, placed.face_normals[face] @ R_WM.T, linear
+            seen = (colors[:, 3] >= _CUTOFF) | (mode not in ("MASK", "BLEND"))
+            normals = placed.face_normals[face] @ R_WM.T
+            sampled = scale * points @ R_WM.T, normals, colors[:, :3]
             parts.append([each[seen] for each in sampled])
     points, normals, colors = (np.concatenate(each) for each in zip(*parts, strict=True))
     return points, normals, colors, area
 
 
 def _base_colors(mesh: trimesh.Trimesh, face: NDArray, weights: NDArray) -> NDArray[np.float64]:
-    """Returns the colors (N, 4), 0 to 255, at barycentric coordinates (N, 3) of faces (N,)."""
+    """Returns linear colors (N, 4), 0 to 1, at barycentric coordinates (N, 3) of faces (N,)."""
     visual: Any = mesh.visual
     if not isinstance(visual, TextureVisuals):
-        return visual.face_colors[face].astype(float)
+        return _linear(visual.face_colors[face])
     material = visual.material
-    factor = getattr(material, "baseColorFactor", None)
-    factor = np.full(4, 255.0) if factor is None else np.asarray(factor, float)
+    factor = getattr(material, "baseColorFactor", None)  # linear, as in glTF
+    factor = np.ones(4) if factor is None else np.asarray(factor) / 255.0
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is None or visual.uv is None:
-        plain = factor if hasattr(material, "baseColorFactor") else material.main_color
-        return np.tile(np.asarray(plain, float), (len(face), 1))
+        is_pbr = hasattr(material, "baseColorFactor")
+        return np.tile(factor if is_pbr else _linear(material.main_color), (len(face), 1))
     uv = (weights[..., None] * visual.uv[mesh.faces[face]]).sum(axis=1)
-    return uv_to_interpolated_color(uv, image) * (factor / 255.0)
+    return _linear(uv_to_interpolated_color(uv, image)) * factor
+
+
+def _linear(colors: NDArray) -> NDArray[np.float64]:
+    """Returns linear colors and alphas (..., 4), 0 to 1, of those of images, 0 to 255."""
+    return (np.asarray(colors) / 255.0) ** [GAMMA, GAMMA, GAMMA, 1.0]
 
 
 def _sample_surface(

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from PIL import Image
 from pydrake.math import RigidTransform
+from trimesh.visual.material import PBRMaterial
 
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.monitor import Outcome
@@ -51,6 +52,18 @@ def test_viewers_show_the_colors_of_textures(tmp_path):
     red, blue = points[:, 0] < 3.0, points[:, 0] > 5.0
     assert (colors[red, 0] > 0.4).all() and (colors[red, 2] < 0.01).all()
     assert (colors[blue, 2] > 0.4).all() and (colors[blue, 0] < 0.01).all()
+
+
+def test_factors_of_materials_are_linear_and_textures_are_not(tmp_path):
+    box = trimesh.creation.box([1.0, 1.0, 1.0])
+    picture = Image.new("RGB", (2, 2), (128, 128, 128))
+    for texture, expected in ((None, 0.5), (picture, 0.5 * (128 / 255) ** 2.2)):
+        material = PBRMaterial(baseColorFactor=[0.5, 0.5, 0.5, 1.0], baseColorTexture=texture)
+        box.visual = trimesh.visual.TextureVisuals(np.zeros((8, 2)), material=material)
+        path = tmp_path / "box.glb"
+        trimesh.Scene([box]).export(path)
+        _, _, colors, _ = sample_colors(path, "z", 1.0, 100)
+        np.testing.assert_allclose(colors, expected, atol=0.01)
 
 
 def test_camera_shows_the_mesh_also_through_a_lens(opengl, world):
