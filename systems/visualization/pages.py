@@ -36,11 +36,9 @@ _COVARIANCE_SCALE = 256.0
 
 
 def pack_gaussians(scene: GaussianScene) -> NDArray[np.uint32]:
-    """Packs N Gaussians for the page's shader into (N, 8) words of 32 bits.
-
-    They are the center as three floats [m]; RGB of degree 0 and opacity as bytes, lowest first; the
-    covariance's xx, xy, xz, yy, yz, zz as half floats [m^2 / 256], lowest first; and 0.
-    """
+    """Packs N Gaussians for the page's shader into (N, 8) words of 32 bits: the center as three
+    floats [m]; RGB of degree 0 and opacity as bytes, lowest first; the covariance's xx, xy, xz, yy,
+    yz, zz as half floats [m^2 / 256], lowest first; and 0."""
     words = np.zeros((len(scene.means), 8), np.uint32)
     words[:, :3] = scene.means.view(np.uint32)
     shades = np.column_stack([scene.base_colors, scene.opacities])
@@ -113,7 +111,7 @@ class HtmlPage:
 
 
 def compressed(data: bytes) -> str:
-    """Compresses bytes to text for `unpack` of `page/page.js`, deterministically."""
+    """Compresses bytes to text for `inflate` of `page/page.js`, deterministically."""
     return base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()
 
 
@@ -184,11 +182,7 @@ class ViewerScene:
 
 
 def scene_page(meshcat_page: str, scene: ViewerScene) -> str:
-    """Makes a self-contained HTML page of a scene.
-
-    Args:
-        meshcat_page: `Meshcat.StaticHtml()` with further objects.
-    """
+    """Makes a self-contained HTML page of a scene; `meshcat_page` is `Meshcat.StaticHtml()`."""
     size = scene.upper_W - scene.lower_W
     unit = "m" if scene.metric else "units"
     lengths = " x ".join(f"{length:.3g}" for length in size)
@@ -358,25 +352,17 @@ def _flight_data(flight: ReplayedFlight, color: str) -> dict[str, Any]:
         "speeds": rounded(np.linalg.norm(state.v_WB, axis=1)),
         "clearances": rounded(flight.clearances[rows]),
         "plans": _plans(flight.hypotheses),
-        "frames": flight.frames
-        and {
-            "period": flight.frames.period,
-            "color": list(flight.frames.color),
-            "depth": list(flight.frames.depth),
-        },
+        "frames": flight.frames and vars(flight.frames),
     }
 
 
 def _sphere_tracks(spheres: MovingSpheres, duration: float) -> dict[str, Any]:
     times = np.arange(0.0, duration + 2 * _SPHERES_PERIOD, _SPHERES_PERIOD)
-    centers = [np.round(spheres.centers(time), 3) for time in times]
+    centers = np.array([spheres.centers(time) for time in times])
     return {
         "period": _SPHERES_PERIOD,
         "radii": rounded(spheres.radii),
-        "centers": [
-            [row.tolist() if np.isfinite(row).all() else [None] * 3 for row in rows]
-            for rows in centers
-        ],
+        "centers": rounded(np.round(centers, 3)),
     }
 
 
@@ -404,10 +390,8 @@ def live_page(
 ) -> str:
     """Makes an HTML page with the Gaussians that receives the rest from `meshcat`, on this machine.
 
-    It hides the points at `/splatpilot/scene`, and shows the last `send_picture` in its panel.
-
-    Args:
-        cut: [m] height above which Gaussians are hidden at first.
+    It shows the last `send_picture` in its panel, and hides the points at `/splatpilot/scene` and,
+    at first, Gaussians above the height `cut` [m].
     """
     fov_y, heights = float(np.degrees(view.fov_y)), {"lower": view.lower, "upper": view.upper}
     return splat_page(

@@ -40,10 +40,8 @@ class CaptureCameras {
   at(x, y) {
     let nearest = 18, found = null;
     this.poses.forEach((pose, k) => {
-      const p = new THREE.Vector3(0, 0, 0.6 * this.size).applyMatrix4(pose);
-      this.viewer.scene.localToWorld(p).project(this.viewer.camera);
-      const distance = Math.hypot(
-        (0.5 + 0.5 * p.x) * window.innerWidth - x, (0.5 - 0.5 * p.y) * window.innerHeight - y);
+      const p = inWindow(new THREE.Vector3(0, 0, 0.6 * this.size).applyMatrix4(pose));
+      const distance = Math.hypot(p.x - x, p.y - y);
       if (p.z < 1 && distance < nearest) [nearest, found] = [distance, k];
     });
     return found;

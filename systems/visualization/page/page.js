@@ -8,11 +8,6 @@ async function inflate(text) {
   return new Response(stream).arrayBuffer();
 }
 
-// Unpacks the compressed text of an element.
-function unpack(id) {
-  return inflate(document.getElementById(id).textContent);
-}
-
 // The sky is an equirectangular picture whose columns run against the azimuth.
 function showSky() {
   const picture = document.getElementById("sky").textContent;
@@ -134,6 +129,12 @@ class Views {
   }
 }
 
+// The point of the window [px], and its depth, at which the view shows a point of W.
+function inWindow(p) {
+  const {x, y, z} = viewer.scene.localToWorld(p.clone()).project(viewer.camera);
+  return {x: (0.5 + 0.5 * x) * window.innerWidth, y: (0.5 - 0.5 * y) * window.innerHeight, z};
+}
+
 // The pose that looks from `eye` at `target`, both in W.
 function lookAt(eye, target) {
   return new THREE.Matrix4().lookAt(eye, target, new THREE.Vector3(0, 0, 1)).setPosition(eye);
@@ -141,6 +142,7 @@ function lookAt(eye, target) {
 
 // Shows the Gaussians and the sky; returns the former and the page's other data.
 async function openPage() {
+  const unpack = (id) => inflate(document.getElementById(id).textContent);
   viewer.camera.far = 1000;
   const splats = new Splats(viewer, new Uint32Array(await unpack("gaussians")));
   viewer.scene.add(splats.mesh);

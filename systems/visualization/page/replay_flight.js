@@ -65,10 +65,9 @@ class ReplayFlight {
   }
 
   pose(time) {
-    const {i, j, s} = this.at(time);
-    return new THREE.Matrix4().compose(
-      this.points[i].clone().lerp(this.points[j], s),
-      this.rotations[i].clone().slerp(this.rotations[j], s), new THREE.Vector3(1, 1, 1));
+    const {i, j, s} = this.at(time), rotation = this.rotations[i].clone();
+    return new THREE.Matrix4().makeRotationFromQuaternion(rotation.slerp(this.rotations[j], s))
+      .setPosition(this.position(time));
   }
 
   value(name, time) {

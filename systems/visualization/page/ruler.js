@@ -20,8 +20,7 @@ class Ruler {
       object.frustumCulled = false;
       object.renderOrder = 9;
     }
-    this.label = document.body.appendChild(
-      Object.assign(document.createElement("div"), {id: "view-label"}));
+    this.label = addElement(document.body, "div", {id: "view-label"});
     viewer.scene.add(this.group);
     this.set([]);
   }
@@ -55,9 +54,8 @@ class Ruler {
   // Keeps the label at the middle of the line.
   moveLabel() {
     if (!this.line.visible) return;
-    const p = this.viewer.scene.localToWorld(this.middle.clone()).project(this.viewer.camera);
-    this.label.hidden = p.z > 1;
-    this.label.style.left = `${(0.5 + 0.5 * p.x) * window.innerWidth}px`;
-    this.label.style.top = `${(0.5 - 0.5 * p.y) * window.innerHeight}px`;
+    const {x, y, z} = inWindow(this.middle);
+    this.label.hidden = z > 1;
+    Object.assign(this.label.style, {left: `${x}px`, top: `${y}px`});
   }
 }
