@@ -137,7 +137,7 @@ def environments(effort: Effort) -> Iterator[Headline]:
             scenario,
             num_worlds=effort.worlds,
             observation=(*images, *states),
-            camera=replace(camera, width=width, height=height),
+            camera=replace(camera, width=width, height=height, merged_spread=2.0),
             threads=available_cores(),
             rate=RATE,
             pool=envs["state"].pool if envs else None,
@@ -154,7 +154,7 @@ def environments(effort: Effort) -> Iterator[Headline]:
     yield Headline(f"{many}, depth 64x36", 1 / best["depth"], "steps/s", 1200)
     yield Headline(f"the same, {over}", best["drake depth"] / best["depth"], "x", 12)
     for name, required in (("RGB-D 64x48", 3000), ("RGB-D 160x120", 900)):
-        yield Headline(f"{many}, {name}", 1 / best[name], "steps/s", required)
+        yield Headline(f"{many}, {name}, colors merged", 1 / best[name], "steps/s", required)
     mask = np.arange(effort.vehicles) == 0
     reset = partial(envs["state"].reset, options={"reset_mask": mask})
     yield Headline("reset of one environment", 1e3 * wall_seconds(reset, 20), "ms", max=2)
@@ -307,8 +307,11 @@ def training(effort: Effort) -> Iterator[Headline]:
     import torch
 
     from splatpilot.systems.common.processes import one_torch_thread
-    from splatpilot.training.policies.evaluation import render_depth
-    from splatpilot.training.policies.rollouts import DifferentiableRollout, RolloutConfig
+    from splatpilot.training.policies.rollouts import (
+        DifferentiableRollout,
+        RolloutConfig,
+        render_depth,
+    )
     from splatpilot.training.policies.train import step_optimizer
     from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroLoss
     from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds

@@ -28,7 +28,7 @@ from splatpilot.training.policies.networks import (
     TrajectoryModule,
     load_weights,
 )
-from splatpilot.training.policies.train_distilled_rgb import DistilledRgbModule
+from splatpilot.training.policies.train_diffaero_rgb import DistilledRgbModule
 
 _RECURRENT = {
     "diffaero": DIFFAERO_NETWORK,

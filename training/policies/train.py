@@ -24,28 +24,10 @@ from splatpilot.systems.common.readers import error_summary
 from splatpilot.systems.common.registry import Registry
 from splatpilot.systems.common.validation import require, validate
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.training.policies import train_agile_autonomy as agile
+from splatpilot.training.policies import train_depthnav, train_diffaero, train_student
+from splatpilot.training.policies import train_diffaero_rgb as rgb
 from splatpilot.training.policies.rollouts import RolloutTrainer
-from splatpilot.training.policies.train_agile_autonomy import (
-    AgileAutonomyTrainer,
-    AgileAutonomyTraining,
-)
-from splatpilot.training.policies.train_depthnav import DepthNavLearner, DepthNavTraining
-from splatpilot.training.policies.train_diffaero import (
-    DiffAeroLearner,
-    DiffAeroTofLearner,
-    DiffAeroTofTraining,
-    DiffAeroTraining,
-)
-from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
-from splatpilot.training.policies.train_distilled_rgb import (
-    DistilledRgbTrainer,
-    DistilledRgbTraining,
-)
-from splatpilot.training.policies.train_student import (
-    StudentDepthTraining,
-    StudentRgbTraining,
-    StudentTrainer,
-)
 from splatpilot.training.policies.trainer import Trainer, TrainingConfig
 from splatpilot.training.reconstruction.checkpoint import event_log, load_tensors, save_tensors
 
@@ -304,13 +286,16 @@ def _rollout_trainer(name: str, learner: Any, config: Any) -> Trainer:
 
 
 for _name, _config, _learner in (
-    ("diffaero", DiffAeroTraining, DiffAeroLearner),
-    ("depthnav", DepthNavTraining, DepthNavLearner),
-    ("diffaero_tof", DiffAeroTofTraining, DiffAeroTofLearner),
+    ("diffaero", train_diffaero.DiffAeroTraining, train_diffaero.DiffAeroLearner),
+    ("depthnav", train_depthnav.DepthNavTraining, train_depthnav.DepthNavLearner),
+    ("diffaero_tof", train_diffaero.DiffAeroTofTraining, train_diffaero.DiffAeroTofLearner),
 ):
     register_trainer(_name, _config, partial(_rollout_trainer, _name, _learner))
-register_trainer("agile_autonomy", AgileAutonomyTraining, AgileAutonomyTrainer)
-register_trainer("diffaero_rgb", DiffAeroRgbTraining, DiffAeroRgbTrainer)
-register_trainer("distilled_rgb", DistilledRgbTraining, DistilledRgbTrainer)
-register_trainer("student_rgb", StudentRgbTraining, StudentTrainer)
-register_trainer("student_depth", StudentDepthTraining, StudentTrainer)
+for _name, _config, _trainer in (
+    ("agile_autonomy", agile.AgileAutonomyTraining, agile.AgileAutonomyTrainer),
+    ("diffaero_rgb", rgb.DiffAeroRgbTraining, rgb.DiffAeroRgbTrainer),
+    ("distilled_rgb", rgb.DistilledRgbTraining, rgb.DistilledRgbTrainer),
+    ("student_rgb", train_student.StudentRgbTraining, train_student.StudentTrainer),
+    ("student_depth", train_student.StudentDepthTraining, train_student.StudentTrainer),
+):
+    register_trainer(_name, _config, _trainer)

@@ -28,14 +28,14 @@ from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.training.policies import vehicles
 from splatpilot.training.policies.augmentation import check_noise, depth_noise, noisy_depth
-from splatpilot.training.policies.evaluation import (
+from splatpilot.training.policies.networks import TrajectoryModule
+from splatpilot.training.policies.ray_casting import PixelRays
+from splatpilot.training.policies.rollouts import (
     FlightConditions,
     FlightTrainer,
     FlightTraining,
     render_depth,
 )
-from splatpilot.training.policies.networks import TrajectoryModule
-from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.trainer import Schedule
 from splatpilot.training.policies.training_worlds import STARTS
 
@@ -212,8 +212,7 @@ class AgileAutonomyTrainer(FlightTrainer):
         tracked = vehicle.p[:, None].repeat(1, NUM_WAYPOINTS + config.ask_every, 1)
         rows: list[dict[str, Tensor]] = []
         for step in steps:
-            clearance, inside = worlds.clearance(vehicle.p, world)
-            ended = (clearance < 0.0) | ~inside | ((vehicle.p - p_WG).norm(dim=1) < 0.5)
+            ended = worlds.ended(vehicle.p, world)
             if ended.any():
                 new, flown = self._start(world, student)
                 vehicle = vehicles.choose_rows(ended, new, vehicle)

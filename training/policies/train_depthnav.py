@@ -97,24 +97,14 @@ class DepthNavLearner:
         return a_WB, heading, torch.cat([hidden, start_yaw[:, None]], 1)
 
     def losses(self, transitions: Transitions) -> dict[str, Tensor]:
-        weights = self._loss
         d, approach = transitions.clearance[:, 0], transitions.approach[:, 0].clamp(min=0.0)
         collision = approach * (1.0 - d).clamp(min=0.0).square()
-        collision = collision + weights.nearness * torch.nn.functional.softplus(-6.0 * d)
-        velocity = torch.nn.functional.smooth_l1_loss(
-            transitions.v_mean, transitions.v_target, reduction="none"
-        )
+        collision = collision + self._loss.nearness * torch.nn.functional.softplus(-6.0 * d)
         assert transitions.heading is not None
         path = torch.atan2(transitions.v_target[:, 1], transitions.v_target[:, 0])
-        terms = {
-            "velocity": velocity.sum(1),
-            "collision": collision,
-            "acceleration": transitions.a.square().sum(1),
-            "jerk": transitions.jerk.square().sum(1),
-            "rate": transitions.jerk[:, :2].square().sum(1) / GRAVITY**2,
-            "yaw": 1.0 - torch.cos(transitions.heading - path),
-        }
-        return {name: getattr(weights, name) * term.mean() for name, term in terms.items()}
+        rate = transitions.jerk[:, :2].square().sum(1) / GRAVITY**2
+        yaw = 1.0 - torch.cos(transitions.heading - path)
+        return transitions.losses(self._loss, collision=collision, rate=rate, yaw=yaw)
 
 
 def quaternion_from_rotation(R: Tensor) -> Tensor:

@@ -94,21 +94,11 @@ class DiffAeroLearner:
         return (R_WH @ command_H[:, :, None])[:, :, 0], None, memory
 
     def losses(self, transitions: Transitions) -> dict[str, Tensor]:
-        weights = self._loss
-        d = transitions.clearance - weights.margin
+        d = transitions.clearance - self._loss.margin
         approach = transitions.approach.clamp(min=0.0)
-        clearance = (approach * (1.0 - d).clamp(min=0.0).square()).sum(1).mean()
-        contact = (approach * torch.nn.functional.softplus(-32.0 * d) / 4.0).sum(1).mean()
-        velocity = torch.nn.functional.smooth_l1_loss(
-            transitions.v_mean, transitions.v_target, reduction="none"
-        )
-        return {
-            "velocity": weights.velocity * velocity.sum(1).mean(),
-            "clearance": weights.clearance * clearance,
-            "contact": weights.contact * contact,
-            "acceleration": weights.acceleration * transitions.a.square().sum(1).mean(),
-            "jerk": weights.jerk * transitions.jerk.square().sum(1).mean(),
-        }
+        clearance = (approach * (1.0 - d).clamp(min=0.0).square()).sum(1)
+        contact = (approach * torch.nn.functional.softplus(-32.0 * d) / 4.0).sum(1)
+        return transitions.losses(self._loss, clearance=clearance, contact=contact)
 
 
 @dataclass

@@ -1,6 +1,7 @@
 """Worlds to train in: of the benchmark's kinds, by seeds that it does not use, and captured scenes
 in which it does not fly."""
 
+import os
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
@@ -12,10 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 from joblib import Memory
+from pydrake.math import RigidTransform, RotationMatrix
 from torch import Tensor
 
 from splatpilot.diagrams.scenarios import scenario_file
+from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.feasibility import choose_start_and_goal
+from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import (
     WorldConfig,
     make_spec,
@@ -36,10 +40,13 @@ from splatpilot.systems.common.provenance import (
 )
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.splats.baked_scene import BatchRenderer
+from splatpilot.systems.splats.splat_camera import color_pixels
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.corpus import library
 from splatpilot.training.policies.ray_casting import Geometry, Grids, MixedGeometry, ShapeGeometry
-from splatpilot.training.policies.vehicles import Vehicle
+from splatpilot.training.policies.vehicles import Vehicle, camera_poses
 
 _LIMIT = 1 << 30  # [bytes] of the cache; the files that were used last stay.
 
@@ -189,6 +196,11 @@ class WorldBatch:
         inside = (p_WQ > self.lower_W[world]) & (p_WQ < self.upper_W[world])
         return distances[:, 0] - VEHICLE_RADIUS, inside.all(1)
 
+    def ended(self, p_WB: Tensor, world: Tensor) -> Tensor:
+        """Tells which vehicles (N,) are in contact, outside the volume or 0.5 m from the goal."""
+        clearance, inside = self.clearance(p_WB, world)
+        return (clearance < 0.0) | ~inside | ((p_WB - self.p_WG[world]).norm(dim=1) < 0.5)
+
     def color(self, vehicle: Vehicle, world: Tensor) -> Tensor | None:
         """Renders colors (N, H, W, 3) by the `views`, if there are any."""
         return None if self.views is None else self.views.render(vehicle, world)
@@ -259,20 +271,28 @@ def validation_worlds(selection: WorldSelection, device: torch.device | str = "c
     return WorldBatch(worlds, None, device)
 
 
-def world_turns(selection: WorldSelection, count: int, first: int) -> list[tuple[int, str]]:
+def _world_turns(selection: WorldSelection, count: int, first: int) -> list[tuple[int, str]]:
     """Lists the seed, from `first` on, and the kind or scene of each of `count` worlds."""
     return list(zip(range(first, first + count), cycle(selection.turns), strict=False))
+
+
+def _captured_worlds(selection: WorldSelection) -> dict[str, World]:
+    """Makes the worlds of the scenes."""
+    return {
+        scene: make_world(scene_config(library.training_scene(scene)), seed=0)
+        for scene in selection.scenes
+    }
 
 
 def _make_worlds(
     selection: WorldSelection, count: int, first: int, what: str
 ) -> list[TrainingWorld]:
-    scenes = {}
-    for scene in selection.scenes:
-        esdf = make_world(scene_config(library.training_scene(scene)), seed=0).esdf
-        scenes[scene] = esdf, esdf.conservative()
+    scenes = {
+        scene: (world.esdf, world.esdf.conservative())
+        for scene, world in _captured_worlds(selection).items()
+    }
     cache, worlds = WorldCache(), []
-    turns = world_turns(selection, count, first)
+    turns = _world_turns(selection, count, first)
     for seed, turn in Progress(turns, f"making {what}", unit="world"):
         if turn not in scenes:
             worlds.append(cache.world(library.scenario_world(turn), seed))
@@ -281,3 +301,66 @@ def _make_worlds(
         p_WS, p_WG, _ = choose_start_and_goal(esdf, _SCENE_MARGIN, _MAX_SCENE_PATH, seed=seed)
         worlds.append(TrainingWorld(conservative, esdf.lower_W, esdf.upper_W, p_WS, p_WG))
     return worlds
+
+
+class WorldViews:
+    """The Gaussians of the worlds of a `WorldBatch`, seen by the vehicles' cameras.
+
+    Args:
+        count, first: number of worlds, and the seed of the first, as in `training_worlds`.
+        camera: its `merged_spread` may be larger in training than in flight.
+    """
+
+    def __init__(
+        self, selection: WorldSelection, count: int, first: int, camera: OnboardCamera
+    ) -> None:
+        scenes = _captured_worlds(selection)
+        turns = Progress(_world_turns(selection, count, first), "rendering worlds", unit="world")
+        self._worlds = [
+            scenes.get(turn) or make_world(library.scenario_world(turn), seed)
+            for seed, turn in turns
+        ]
+        self._seen = list(self._worlds)
+        # (W, 2), seed and strength of each appearance; a strength of 0 is the world's own.
+        self.looks = torch.zeros(count, 2, dtype=torch.float64)
+        self._camera, self._renderer = camera, BatchRenderer(os.cpu_count() or 1)
+
+    def repaint(self, strength: float, generator: torch.Generator) -> None:
+        """Gives a random world another appearance, of a strength up to `strength`."""
+        drawn = torch.rand(3, generator=generator, dtype=torch.float64, device=generator.device)
+        world, seed, part = drawn.tolist()
+        index = int(world * len(self._worlds))
+        self.looks[index, 0], self.looks[index, 1] = int(seed * 2**31), part * strength
+        self._paint(index)
+
+    def restore(self, looks: Tensor) -> None:
+        """Restores the appearances `looks`."""
+        self.looks = looks
+        for index in looks[:, 1].nonzero()[:, 0].tolist():
+            self._paint(index)
+
+    def _paint(self, index: int) -> None:
+        seed, strength = self.looks[index].tolist()
+        self._seen[index] = randomize_appearance(self._worlds[index], strength, int(seed))
+
+    @torch.no_grad()
+    def render(self, vehicle: Vehicle, world: Tensor) -> Tensor:
+        """Renders colors (N, H, W, 3), uint8, from the vehicles' cameras, each in its `world`
+        (N,)."""
+        poses = (part.double().cpu().numpy() for part in camera_poses(vehicle))
+        X_WCs = [
+            RigidTransform(RotationMatrix.ProjectToRotationMatrix(R_WC), p_WC)
+            for p_WC, R_WC in zip(*poses, strict=True)
+        ]
+        worlds = [self._seen[index] for index in world.tolist()]
+        info = self._camera.camera_info()
+        color = self._renderer.render_color(
+            [world.baked for world in worlds],
+            info.intrinsic_matrix(),
+            info.width(),
+            info.height(),
+            X_WCs,
+            backgrounds=[world.background for world in worlds],
+            merged_spread=self._camera.merged_spread,
+        )
+        return torch.from_numpy(color_pixels(color)).to(world.device)

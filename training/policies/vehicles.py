@@ -125,6 +125,14 @@ class BodyRate(NamedTuple):
 
 Vehicle = PointMass | BodyRate
 
+CAMERA_AHEAD = 0.1  # [m] offset of the camera from the vehicle's center along body x
+
+
+def camera_poses(vehicle: Vehicle) -> tuple[Tensor, Tensor]:
+    """Computes p_WC (N, 3) [m] and R_WC (N, 3, 3) of the vehicles' cameras."""
+    x, y, z = vehicle.attitude().unbind(2)
+    return vehicle.p + CAMERA_AHEAD * x, torch.stack([-y, -z, x], 2)
+
 
 class Observation(NamedTuple):
     """Inputs of a policy for N vehicles at one step."""

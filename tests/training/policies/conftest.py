@@ -13,8 +13,8 @@ from splatpilot.training.corpus.collect import shard_folder
 from splatpilot.training.corpus.corpus import CONFIG, EXPERT, CorpusConfig, Samples, write_shard
 from splatpilot.training.corpus.expert import Labeler
 from splatpilot.training.corpus.library import WorldSource, record_world
-from splatpilot.training.policies.evaluation import CAMERA_AHEAD
 from splatpilot.training.policies.ray_casting import PixelRays, ShapeGeometry
+from splatpilot.training.policies.vehicles import CAMERA_AHEAD
 
 P_WG = np.array([11.0, 4.0, 1.5])
 UPPER_W = np.array([12.0, 8.0, 3.0])

@@ -23,7 +23,7 @@ from splatpilot.systems.policies import checkpoint as policy_checkpoint
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, checkpoint_policy
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.training.policies import train, training_worlds
-from splatpilot.training.policies.evaluation import evaluate_agent
+from splatpilot.training.policies.rollouts import evaluate_agent
 from splatpilot.training.policies.train import TRAINERS, run
 from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroTraining
 from splatpilot.training.policies.training_worlds import WorldCache

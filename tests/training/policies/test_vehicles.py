@@ -16,20 +16,26 @@ from splatpilot.systems.vehicle.flatness import (
 )
 from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant, hover_state
 from splatpilot.systems.vehicle.state import pose_from_state
-from splatpilot.training.policies.evaluation import (
-    CAMERA_AHEAD,
+from splatpilot.training.policies.ray_casting import PixelRays
+from splatpilot.training.policies.rollouts import (
+    DifferentiableRollout,
     FlightConditions,
+    RolloutConfig,
     evaluate_agent,
     render_depth,
 )
-from splatpilot.training.policies.ray_casting import PixelRays
-from splatpilot.training.policies.rollouts import DifferentiableRollout, RolloutConfig
 from splatpilot.training.policies.train_agile_autonomy import (
     AgileAutonomyTrainer,
     AgileAutonomyTraining,
 )
 from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds
-from splatpilot.training.policies.vehicles import BodyRate, History, PointMass, map_tensors
+from splatpilot.training.policies.vehicles import (
+    CAMERA_AHEAD,
+    BodyRate,
+    History,
+    PointMass,
+    map_tensors,
+)
 
 CONTROL = FlatnessControllerConfig()
 

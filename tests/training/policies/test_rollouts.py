@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from splatpilot.training.policies.augmentation import depth_noise
-from splatpilot.training.policies.evaluation import FlightConditions, Outcomes, evaluate_agent
 from splatpilot.training.policies.ray_casting import PixelRays
+from splatpilot.training.policies.rollouts import FlightConditions, Outcomes, evaluate_agent
 from splatpilot.training.policies.training_worlds import WorldSelection, validation_worlds
 
 WORLDS = WorldSelection(kinds=["P01"], held_out=7)
