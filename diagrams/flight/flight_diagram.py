@@ -1,7 +1,6 @@
 """AddFlight and BuildFlightDiagram: the closed loop of vehicle, sensors, policy and controller."""
 
 import re
-from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -286,9 +285,10 @@ def AddFlight(
             radius=scenario.vehicle.radius,
         )
         systems.append(geometry)
-    counts = Counter(system.get_name() for system in builder.GetSystems())
-    [(common, count)] = counts.most_common(1)
-    require(count == 1, "names of systems", "different", f"{count} of {common!r}", _RENAME)
+    names = [system.get_name() for system in builder.GetSystems()]
+    twice = next((each for each in names if names.count(each) > 1), None)
+    found = f"{names.count(twice)} of {twice!r}"
+    require(twice is None, "names of systems", "different", found, _RENAME)
     parts = FlightParts(
         name=name,
         scenario=scenario,
