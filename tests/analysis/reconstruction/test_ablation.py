@@ -16,7 +16,7 @@ from splatpilot.training.reconstruction.metrics import ViewMetrics
 
 def test_ablation_end_to_end(room, set_fields, capsys, monkeypatch):
     monkeypatch.setattr(measure_scene, "_write_views", lambda *_: None)  # which take seconds
-    settings = ("iterations=4", "threads=1", "initial_gaussians=500", "voxel_size=0.3")
+    settings = ("iterations=4", "threads=1", "initial_gaussians=500", "voxel_size=0.5")
     out, settings = room.folder / "out", set_fields(*settings, "image_width=32")
     ablate = ["scene", "ablate", "room", "--out", str(out), *settings]
     assert main(ablate) == 0

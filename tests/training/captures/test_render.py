@@ -133,7 +133,7 @@ def test_renamed_copy_of_a_test_mesh_is_of_split_test(opengl, room, tmp_path, mo
     with pytest.raises(ValueError, match=r"capture.obj must be test, got train; it shows ware"):
         run(world=copy, out=tmp_path / "out", config=small(split="train"))
     run(world=copy, out=tmp_path / "out", config=small(yaws=[0.0]))
-    scene = ReconstructConfig(iterations=0, voxel_size=0.2)
+    scene = ReconstructConfig(iterations=0, voxel_size=0.4)
     reconstruct(read_capture(tmp_path / "out"), tmp_path / "scene", scene)
     assert read_scene_metadata(tmp_path / "scene").split == "test"
 

@@ -62,7 +62,7 @@ def test_far_poses_are_checked_where_the_files_have_them(tmp_path):
 
 
 def test_scene_of_a_far_capture_keeps_its_origin(tmp_path):
-    scene, config = tmp_path / "scene", ReconstructConfig(iterations=0, voxel_size=0.2)
+    scene, config = tmp_path / "scene", ReconstructConfig(iterations=0, voxel_size=0.4)
     summary = reconstruct(read_capture(write_far(tmp_path / "room")), scene, config)
     assert "positions are relative to" in str(summary)
     metadata = read_scene_metadata(scene)
