@@ -5,6 +5,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from pydrake.geometry import Meshcat
 
 
 class Page:
@@ -40,6 +41,13 @@ class Page:
         self.settle()
         return value
 
+    def set_slider(self, id: str, value: float) -> None:
+        self.tab.evaluate(
+            f"() => {{ const s = document.getElementById('{id}'); s.value = {value};"
+            " s.dispatchEvent(new Event('input')); }"
+        )
+        self.settle()
+
     def picture(self) -> np.ndarray:
         """(H, W, 3) uint8, blue first, of the scene alone."""
         self.tab.add_style_tag(content=f"{self.hidden}, .dg {{ display: none !important }}")
@@ -62,16 +70,33 @@ def browser():
 
 @pytest.fixture
 def open_in_browser(browser, tmp_path):
-    """Opens HTML as a `Page` in a window of this width and height [px]."""
-    tabs = []
+    """Opens HTML as a `Page` in a window of this width and height [px]; no page may have errors."""
+    pages = []
 
     def opened(html: str, width: int, height: int, settled: str, hidden: str) -> Page:
         path = tmp_path / "page.html"
         path.write_text(html)
-        tabs.append(browser.new_page(viewport={"width": width, "height": height}))
-        tabs[-1].set_default_timeout(120_000)
-        return Page(tabs[-1], path, settled, hidden)
+        tab = browser.new_page(viewport={"width": width, "height": height})
+        tab.set_default_timeout(120_000)
+        pages.append(Page(tab, path, settled, hidden))
+        return pages[-1]
 
     yield opened
-    for tab in tabs:
-        tab.close()
+    for page in pages:
+        page.tab.close()
+        assert page.errors == []
+
+
+@pytest.fixture
+def plain_meshcat():
+    """Makes a Meshcat of one background color, without grid and axes."""
+
+    def make(background=(0.0, 0.0, 0.0)) -> Meshcat:
+        meshcat = Meshcat()
+        for path in ("/Grid", "/Axes"):
+            meshcat.SetProperty(path, "visible", False)
+        for end in ("top_color", "bottom_color"):
+            meshcat.SetProperty("/Background/<object>", end, list(background))
+        return meshcat
+
+    return make

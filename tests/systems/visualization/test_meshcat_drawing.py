@@ -27,6 +27,7 @@ from splatpilot.systems.visualization.flight_visualizer import (
     DRAWINGS,
     FlightVisualizer,
     fan_mesh,
+    hypothesis_colors,
 )
 from splatpilot.systems.visualization.meshcat_drawing import (
     CameraVisualizer,
@@ -162,6 +163,8 @@ def test_fan_is_ribbons_along_the_plans_in_the_colors_of_their_costs():
     np.testing.assert_allclose(shades[[1, 2], 0], [[0, 1, 0.1], [1, 0, 0.1]])
     assert faces.min() == 0 and faces.max() == 4 * 22 - 1
     assert (faces // 22 == faces[0] // 22).all()
+    colors = hypothesis_colors(np.array([1.0, 2.0, np.inf]))
+    np.testing.assert_allclose(colors, [[0, 1, 0.1], [1, 0, 0.1], [1, 0, 0.1]])
 
 
 def test_moving_spheres_are_drawn(meshcat):

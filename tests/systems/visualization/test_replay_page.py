@@ -8,7 +8,6 @@ import re
 import cv2
 import numpy as np
 import pytest
-from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
@@ -18,7 +17,6 @@ from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import hover_state
-from splatpilot.systems.visualization.flight_visualizer import hypothesis_colors
 from splatpilot.systems.visualization.meshcat_drawing import draw_vehicle
 from splatpilot.systems.visualization.pages import (
     Frames,
@@ -70,17 +68,12 @@ def straight(name: str, outcome: str, y: float = 0.0, roll: float = 0.0) -> Repl
 
 
 @pytest.fixture
-def open_page(open_in_browser):
+def open_page(open_in_browser, plain_meshcat):
     """Opens a page of flights; its window is as large as the onboard camera's image."""
 
     def opened(gaussians, flights, background=(0.2, 0.4, 0.6), spheres=None, view=VIEW):
-        meshcat = Meshcat()
+        meshcat = plain_meshcat(background if isinstance(background, tuple) else (0.0, 0.0, 0.0))
         meshcat.SetCameraPose([-2, 0, 4], [4, 0, 1.5])
-        color = background if isinstance(background, tuple) else (0.0, 0.0, 0.0)
-        for name in ("top_color", "bottom_color"):
-            meshcat.SetProperty("/Background/<object>", name, list(color))
-        for path in ("/Grid", "/Axes"):
-            meshcat.SetProperty(path, "visible", False)
         for k in range(len(flights)):
             draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", 0.35)
         html = replay_page(meshcat.StaticHtml(), gaussians, background, view, flights, spheres)
@@ -118,22 +111,13 @@ def test_page_shows_what_the_camera_sees(open_page, background):
     assert psnr(page.picture(), truth) > 30
     page.run("() => { replay.splats.mesh.visible = false; viewer.set_dirty(); }")
     assert psnr(page.picture(), truth) < 20
-    assert page.errors == []
-
-
-def test_infinite_costs_and_clearances_are_shown(open_page):
-    flight = straight("a", "goal")
-    flight.hypotheses[:, -1], flight.clearances[3] = np.inf, np.inf
-    page = open_page(cloud(np.random.default_rng(1)), [flight])
-    page.run("() => replay.seek(2)")
-    assert page.errors == []
-    assert page.run("() => viewer.camera.far") == 1000
-    colors = hypothesis_colors(np.array([1.0, 2.0, np.inf]))
-    np.testing.assert_allclose(colors, [[0, 1, 0.1], [1, 0, 0.1], [1, 0, 0.1]])
 
 
 def test_controls_move_time_and_view_and_playback_changes_speed_and_loops(open_page):
-    page = open_page(cloud(np.random.default_rng(1)), [straight("a", "goal")])
+    flight = straight("a", "goal")
+    flight.hypotheses[-1, -1], flight.clearances[3] = np.inf, np.inf
+    page = open_page(cloud(np.random.default_rng(1)), [flight])
+    assert page.run("() => viewer.camera.far") == 1000
     page.tab.select_option("#replay-speed", "4")
     page.run("() => { replay.seek(0); replay.play(true); }")
     page.tab.wait_for_function("!replay.playing")
@@ -164,10 +148,7 @@ def test_controls_move_time_and_view_and_playback_changes_speed_and_loops(open_p
             ".getImageData(9, 9, 1, 1).data[0]"
         )
         assert shade == pytest.approx(30 * int(time / 0.5), abs=3)
-    page.tab.evaluate(
-        "() => { const s = document.getElementById('replay-time'); s.value = 1;"
-        " s.dispatchEvent(new Event('input')); }"
-    )
+    page.set_slider("replay-time", 1)
     assert page.run("() => replay.time") == 1.0
     page.tab.keyboard.press("ArrowRight")
     assert page.run("() => replay.time") == pytest.approx(1.1)
@@ -179,7 +160,6 @@ def test_controls_move_time_and_view_and_playback_changes_speed_and_loops(open_p
     whole = page.run("() => { replay.setCut(9); }") or page.picture()
     page.run("() => { replay.setCut(1.5); }")
     assert psnr(page.picture(), whole) < 25
-    assert page.errors == []
 
 
 def test_flights_are_told_apart_and_crashes_start_before_their_end(open_page):
@@ -217,7 +197,6 @@ def test_flights_are_told_apart_and_crashes_start_before_their_end(open_page):
             }}"""
         )
         assert "#" + bytes(pixel).hex() == color
-    assert page.errors == []
 
 
 def test_page_names_its_environment_hides_the_frontier_from_above_and_fits_phones(open_page):
