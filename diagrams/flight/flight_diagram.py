@@ -286,9 +286,9 @@ def AddFlight(
         )
         systems.append(geometry)
     names = [system.get_name() for system in builder.GetSystems()]
-    twice = next((each for each in names if names.count(each) > 1), None)
-    found = f"{names.count(twice)} of {twice!r}"
-    require(twice is None, "names of systems", "different", found, _RENAME)
+    common = max(names, key=names.count)
+    count = names.count(common)
+    require(count == 1, "names of systems", "different", f"{count} of {common!r}", _RENAME)
     parts = FlightParts(
         name=name,
         scenario=scenario,
