@@ -1,8 +1,6 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import gaussian_filter
 
@@ -69,7 +67,7 @@ def test_gradient_is_the_derivative_of_the_interpolant():
 
 
 @pytest.mark.parametrize("occupied_outside", [False, True])
-def test_query_and_distance_agree_anywhere(occupied_outside):
+def test_queries_agree_anywhere_and_have_the_state_of_the_voxel(occupied_outside):
     field, margin = random_field(occupied_outside), 5 * VOXEL
     generator = np.random.default_rng(4)
     p = generator.uniform(field.lower_W - margin, field.upper_W + margin, (5000, 3))
@@ -78,29 +76,19 @@ def test_query_and_distance_agree_anywhere(occupied_outside):
     ]
     p[8:40] = LOWER_W + VOXEL * generator.integers(0, 12, (32, 3))
     p[40], p[41, 1], p[42, 2] = np.nan, np.inf, -np.inf
-    expected = field.query(p).distance
+    expected, gradient, state = field.query(p)
     np.testing.assert_array_equal(field.distance(p), expected)
     np.testing.assert_array_equal(field.distance(np.asfortranarray(p)), expected)
     np.testing.assert_array_equal(field.distance(p[::-2]), expected[::-2])
-    assert np.isfinite(expected[43:]).mean() > (0.99 if occupied_outside else 0.2)
+    inside = ((p >= field.lower_W) & (p <= field.upper_W)).all(axis=1)
+    assert inside.mean() > 0.2 and np.isfinite(expected[inside]).all()
+    np.testing.assert_array_equal(np.isfinite(expected[43:]), inside[43:] | occupied_outside)
+    assert occupied_outside or not gradient[~inside].any()
+    i, j, k = np.minimum((p[inside] - LOWER_W) / VOXEL, [19, 15, 11]).astype(int).T
+    np.testing.assert_array_equal(state[inside][40:], field.states[i, j, k][40:])
+    assert (state[~inside] == OUTSIDE).all()
     with pytest.raises(ValueError, match=r"shape of points .* got \(3, 2\)"):
         field.distance(np.zeros((3, 2)))
-
-
-def test_state_is_that_of_the_voxel_around_the_point():
-    field = random_field()
-    p = points_in(field)
-    i, j, k = np.floor((p - LOWER_W) / VOXEL).astype(int).T
-    np.testing.assert_array_equal(field.query(p).state, field.states[i, j, k])
-
-
-def test_outside_the_bounds_distances_are_nan():
-    x, y, z = 0.5, 2.5, 1.0
-    points = [[x, y, z], [-1.001, y, z], [x, y, 1.701], [np.nan, y, z], [x, np.inf, z]]
-    sample = sphere_field().query(np.array(points))
-    np.testing.assert_array_equal(sample.state, [FREE] + 4 * [OUTSIDE])
-    np.testing.assert_array_equal(np.isnan(sample.distance), [False, True, True, True, True])
-    np.testing.assert_array_equal(sample.gradient[1:], 0.0)
 
 
 def test_scaled_field_is_that_of_the_scaled_scene():
@@ -164,19 +152,13 @@ def test_conservative_field_continues_outside_the_box():
     np.testing.assert_array_equal(sample.distance, field.distance(p))
 
 
-CONSERVATIVE = half_known_field().conservative()
-
-
-@settings(deadline=None, max_examples=50)
-@given(st.integers(0, 2**32 - 1))
-def test_conservative_field_is_lipschitz(seed):
-    field, random = CONSERVATIVE, np.random.default_rng(seed)
-    p = random.uniform(field.lower_W - 0.5, field.upper_W + 0.5, (256, 3))
-    q = p + random.normal(size=(256, 3)) * 10.0 ** random.uniform(-3, 0, (256, 1))
+def test_conservative_field_is_lipschitz():
+    field, random = half_known_field().conservative(), np.random.default_rng(0)
+    p = random.uniform(field.lower_W - 0.5, field.upper_W + 0.5, (20_000, 3))
+    q = p + random.normal(size=p.shape) * 10.0 ** random.uniform(-3, 0, (len(p), 1))
     traveled = np.linalg.norm(p - q, axis=1)
     inside = ((np.stack([p, q]) > field.lower_W) & (np.stack([p, q]) < field.upper_W)).all((0, 2))
-    # Before a face with unknown space behind it depth grows both along and across it, see
-    # Esdf.conservative.
+    # Before a face with unknown space behind it depth grows both along and across it.
     limit = np.where(inside, 1.35, 1.5)
     assert (np.abs(field.distance(p) - field.distance(q)) <= limit * traveled + 1e-6).all()
 

@@ -18,14 +18,14 @@ SIZES = {"distance": 1, "gradient": 3, "clearance": 1}
 SIZES |= {"in_collision": 1, "barrier": 1, "field_state": 1}
 FIELD = AnalyticDistanceField([Sphere(np.zeros(3), 1.0)], np.full(3, -9.0), np.full(3, 9.0))
 BARRIER = float(soft_barrier(1.5, VEHICLE_RADIUS))
+SLOPE = -1.0 / (1.0 + np.exp(-4.0 * (VEHICLE_RADIUS + 1.0 - 1.5)))  # of the barrier, at 1.5 m
 
 
 class CountingField(AnalyticDistanceField):
-    """A sphere of radius 1 at the origin that counts its queries."""
+    queries = 0
 
     def __init__(self):
         super().__init__([Sphere(np.zeros(3), 1.0)], np.full(3, -5.0), np.full(3, 5.0))
-        self.queries = 0
 
     def query(self, p_WQ):
         self.queries += 1
@@ -52,22 +52,6 @@ def test_outputs_beside_an_obstacle_and_outside_the_field(z, expected):
         np.testing.assert_allclose(found, np.broadcast_to(value, size), atol=1e-12)
 
 
-def test_all_outputs_share_one_query_and_follow_the_state():
-    field = CountingField()
-    system = EsdfCollision(field)
-    context = system.CreateDefaultContext()
-    port = system.GetInputPort("state")
-    port.FixValue(context, np.r_[0.0, 0.0, 2.0, np.zeros(10)])
-    for name in SIZES:
-        system.GetOutputPort(name).Eval(context)
-    context.SetTime(1.0)
-    system.GetOutputPort("distance").Eval(context)
-    assert field.queries == 1
-    port.FixValue(context, np.r_[0.0, 0.0, 3.0, np.zeros(10)])
-    assert value_of(system, "distance", context)[0] == pytest.approx(2.0)
-    assert field.queries == 2
-
-
 @pytest.mark.parametrize(("name", "value"), [("radius", -0.1), ("beta", 0.0), ("margin", np.nan)])
 def test_bad_parameters_are_refused(name, value):
     message = f"{name} must be in .* got {value}"
@@ -78,11 +62,14 @@ def test_bad_parameters_are_refused(name, value):
         getattr(system, f"Set{name.title()}")(system.CreateDefaultContext(), value)
 
 
-def test_parameters_of_a_context_change_the_outputs_without_another_query():
+def test_all_outputs_and_parameters_share_one_query_of_a_state():
     field = CountingField()
     system = EsdfCollision(field)
     context = system.CreateDefaultContext()
     system.get_input_port().FixValue(context, np.r_[0.0, 0.0, 2.5, np.zeros(10)])
+    for name in SIZES:
+        system.GetOutputPort(name).Eval(context)
+    context.SetTime(1.0)
     assert value_of(system, "clearance", context)[0] == pytest.approx(1.5 - VEHICLE_RADIUS)
     system.SetRadius(context, 1.6)
     system.SetBeta(context, 2.0)
@@ -92,6 +79,9 @@ def test_parameters_of_a_context_change_the_outputs_without_another_query():
     barrier = float(soft_barrier(1.5, 1.6, 2.0, 0.5))
     assert value_of(system, "barrier", context)[0] == pytest.approx(barrier)
     assert field.queries == 1
+    system.get_input_port().FixValue(context, np.r_[0.0, 0.0, 3.0, np.zeros(10)])
+    assert value_of(system, "distance", context)[0] == pytest.approx(2.0)
+    assert field.queries == 2
 
 
 @pytest.mark.parametrize("field", [3.0, object()])
@@ -112,11 +102,10 @@ def test_outputs_have_exact_derivatives():
 
     np.testing.assert_allclose(gradient("distance"), [0.6, 0.0, 0.8])
     np.testing.assert_allclose(gradient("clearance"), [0.6, 0.0, 0.8])
-    slope = -1.0 / (1.0 + np.exp(-4.0 * (VEHICLE_RADIUS + 1.0 - 1.5)))
-    np.testing.assert_allclose(gradient("barrier"), slope * np.array([0.6, 0.0, 0.8]))
+    np.testing.assert_allclose(gradient("barrier"), SLOPE * np.array([0.6, 0.0, 0.8]))
     system.get_input_port().FixValue(context, ExtractValue(state).ravel())
     system.SetMargin(context, AutoDiffXd(1.0, [1.0]))
-    assert gradient("barrier") == pytest.approx(-slope)
+    assert gradient("barrier") == pytest.approx(-SLOPE)
 
 
 def test_a_diagram_of_plant_and_collision_is_linearized():
@@ -130,8 +119,7 @@ def test_a_diagram_of_plant_and_collision_is_linearized():
     context = diagram.CreateDefaultContext()
     context.SetContinuousState(hover_state([0.0, 0.0, 2.5]))
     diagram.get_input_port().FixValue(context, [9.81, 0.0, 0.0, 0.0])
-    slope = -1.0 / (1.0 + np.exp(-4.0 * (VEHICLE_RADIUS + 1.0 - 1.5)))
-    np.testing.assert_allclose(Linearize(diagram, context).C(), [[0, 0, slope, *np.zeros(10)]])
+    np.testing.assert_allclose(Linearize(diagram, context).C(), [[0, 0, SLOPE, *np.zeros(10)]])
 
 
 def test_the_closest_point_with_clearance_is_found():
