@@ -26,7 +26,7 @@ class TrainableNetwork(nn.Module):
     def __init__(self, spec: NetworkSpec, head_scale: float = 0.1) -> None:
         super().__init__()
         self.spec = spec
-        self.convolutions = _convolutions(spec)
+        self.convolutions = _Convolutions(spec)
         self.state_layer = nn.Linear(spec.state_size, spec.state_features)
         self.memory = nn.GRUCell(spec.image_outputs() + spec.state_features, spec.hidden_size)
         self.head = nn.Linear(spec.hidden_size, spec.output_size)
@@ -37,9 +37,7 @@ class TrainableNetwork(nn.Module):
     def forward(self, image: Tensor, state: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
         """Computes outputs (N, O) and hidden states (N, H) from images (N, height, width), or of
         several channels, states (N, S) and hidden states."""
-        x = image if image.dim() == 4 else image[:, None]
-        for layer in self.convolutions:
-            x = _leaky(layer(x))
+        x = self.convolutions(image if image.dim() == 4 else image[:, None])
         features = _leaky(self.state_layer(state))
         hidden = self.memory(torch.cat([x.flatten(1), features], 1), hidden)
         return self.head(hidden), hidden
@@ -51,7 +49,7 @@ class TrajectoryModule(nn.Module):
     def __init__(self, spec: TrajectoryNetworkSpec) -> None:
         super().__init__()
         self.spec = spec
-        self.convolutions = _convolutions(spec)
+        self.convolutions = _Convolutions(spec)
         joined = spec.image_features + spec.state_features
         self.image_layer = nn.Linear(spec.image_outputs(), spec.image_features)
         self.state_layer = nn.Linear(STATE_SIZE, spec.state_features)
@@ -63,10 +61,7 @@ class TrajectoryModule(nn.Module):
     def forward(self, image: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Computes waypoints (N, 3, 10, 3) [m] and costs (N, 3) from images (N, H, W) and states
         (N, 18)."""
-        x = image[:, None]
-        for layer in self.convolutions:
-            x = _leaky(layer(x))
-        x = _leaky(self.image_layer(x.flatten(1)))
+        x = _leaky(self.image_layer(self.convolutions(image[:, None]).flatten(1)))
         y = _leaky(self.state_layer_2(_leaky(self.state_layer(state))))
         modes = _leaky(self.modes(torch.cat([x, y], 1))).reshape(len(image), MODES, -1)
         output = self.output(_leaky(self.head(modes)))
@@ -76,19 +71,24 @@ class TrajectoryModule(nn.Module):
 
 def load_weights(module: nn.Module, checkpoint: PolicyCheckpoint, prefix: str = "") -> None:
     """Loads the weights whose names begin with `prefix`."""
-    weights = checkpoint.weights.items()
-    state = {
-        k.removeprefix(prefix): torch.from_numpy(v) for k, v in weights if k.startswith(prefix)
-    }
-    module.load_state_dict(state)
+    chosen = {k: w for k, w in checkpoint.weights.items() if k.startswith(prefix)}
+    module.load_state_dict({k.removeprefix(prefix): torch.from_numpy(chosen[k]) for k in chosen})
 
 
 def _leaky(x: Tensor) -> Tensor:
     return nn.functional.leaky_relu(x, LEAK)
 
 
-def _convolutions(spec: DepthSpec) -> nn.ModuleList:
-    return nn.ModuleList(map(make_convolution, spec.image_layers()))
+class _Convolutions(nn.Sequential):
+    """The convolutions of an image, each with a leaky ReLU."""
+
+    def __init__(self, spec: DepthSpec) -> None:
+        super().__init__(*map(make_convolution, spec.image_layers()))
+
+    def forward(self, input: Tensor) -> Tensor:
+        for layer in self:
+            input = _leaky(layer(input))
+        return input
 
 
 def make_convolution(layer: Convolution) -> nn.Conv2d:
@@ -97,9 +97,7 @@ def make_convolution(layer: Convolution) -> nn.Conv2d:
     return nn.Conv2d(*sizes, layer.dilation, layer.groups)
 
 
-IMAGE_MODULES = (
-    student.BLOCKS + 1
-)  # that an image passes: the encoder's, and the layer of its cells
+IMAGE_MODULES = student.BLOCKS + 1  # that an image passes: of the encoder, and of its cells
 
 
 class StudentModule(nn.Module):
@@ -138,7 +136,7 @@ class StudentModule(nn.Module):
         """Returns the first of the `IMAGE_MODULES`."""
         return nn.ModuleList([*self.features, self.cell_layer][:count])
 
-    def encode_image(self, image: Tensor, first: int = 0, last: int = IMAGE_MODULES) -> Tensor:
+    def encode_image(self, image: Tensor, first: int, last: int = IMAGE_MODULES) -> Tensor:
         """Passes images (N, 3, height, width), or the output of the modules before `first`, through
         the `IMAGE_MODULES` from `first` to before `last`."""
         if first < last:

@@ -45,14 +45,8 @@ class Geometry:
         has the minimum depth of all its parts: rays hit surfaces within half a pixel, at the depth
         of the widened surface plus half a pixel's width there."""
         depth = torch.empty(len(p_WC), len(rays.directions_C))
-        self._native.depth(
-            p_WC=_array(p_WC),
-            R_WC=_array(R_WC),
-            world=_array(world),
-            directions_C=rays.directions_C,
-            half_pixel=rays.half_pixel,
-            depth=depth.numpy(),
-        )
+        poses = {"p_WC": _array(p_WC), "R_WC": _array(R_WC), "world": _array(world)}
+        self._native.depth(**poses, **rays._asdict(), depth=depth.numpy())
         return depth.to(p_WC.device)
 
     def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -52,7 +52,7 @@ from splatpilot.training.corpus.corpus import (
 from splatpilot.training.corpus.expert import Labeler
 from splatpilot.training.corpus.library import WorldRecord
 from splatpilot.training.policies import train
-from splatpilot.training.policies.student_data import held_out_worlds
+from splatpilot.training.policies.train_student import held_out_worlds
 from splatpilot.training.policies.trainer import CorpusTraining, Trainer
 
 _PATIENCE = 2.0  # maximum time of a student's flight, in times of the expert's

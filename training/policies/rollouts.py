@@ -4,6 +4,7 @@ differentiated through the dynamics of flight."""
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from operator import itemgetter
 from typing import Any, NamedTuple, Protocol
 
@@ -295,25 +296,23 @@ class DifferentiableRollout:
         self.episodes = map_tensors(lambda _: next(tensors), self.episodes)
         self.generator.set_state(state["generator"])
 
-    def _uniform(self, *size: int) -> Tensor:
-        return torch.rand(*size, generator=self.generator, device=self.generator.device)
-
     def _new_episodes(self) -> Episodes:
         """Begins episodes anywhere in any world, in flight roughly along the path to the goal."""
         config, N = self.config, self.config.environments
+        uniform = partial(torch.rand, generator=self.generator, device=self.generator.device)
 
         def between(limits: list[float], *size: int) -> Tensor:
-            return limits[0] + (limits[1] - limits[0]) * self._uniform(*size)
+            return limits[0] + (limits[1] - limits[0]) * uniform(*size)
 
         def draw(count: int) -> Tensor:
-            return (self._uniform(N) * count).long().clamp(max=count - 1)
+            return (uniform(N) * count).long().clamp(max=count - 1)
 
         world = draw(len(self.worlds))
         p = self.worlds.starts_W[world, draw(STARTS)]
         speed = between(config.speed, N)
         direction = self.worlds.direction(p, world)
-        v = direction * (speed * self._uniform(N))[:, None] + 0.3 * (self._uniform(N, 3) - 0.5)
-        yaw = torch.atan2(direction[:, 1], direction[:, 0]) + 1.0 * (self._uniform(N) - 0.5)
+        v = direction * (speed * uniform(N))[:, None] + 0.3 * (uniform(N, 3) - 0.5)
+        yaw = torch.atan2(direction[:, 1], direction[:, 0]) + 1.0 * (uniform(N) - 0.5)
         vehicle = PointMass(p, v, torch.zeros_like(p), yaw, between(config.lag, N, 1))
         return Episodes(
             vehicle,
@@ -322,7 +321,7 @@ class DifferentiableRollout:
             v,
             self.learner.initial_memory(N),
             speed,
-            self._uniform(N) * config.longest,
+            uniform(N) * config.longest,
         )
 
     def _restart_ended(self, episodes: Episodes) -> Episodes:

@@ -79,11 +79,10 @@ class _Run:
             lr=self.schedule.learning_rate,
             weight_decay=self.schedule.weight_decay,
         )
-        self.progress = _Progress()
+        self.progress, self.clock = _Progress(), CheckpointClock()
         if self.checkpoint.exists():
             self._resume()
         self.spent_before = self.progress.cpu_seconds
-        self.clock = CheckpointClock()
 
     def train(self) -> dict[str, Any]:
         progress, schedule, trainer = self.progress, self.schedule, self.trainer
@@ -106,21 +105,15 @@ class _Run:
                         self._write_weights()
                 if keep or measure or self.clock.is_due:
                     self._save()
-        best = progress.best
-        summary = {
-            "policy": trainer.policy,
-            "seed": self.config.seed,
-            "updates": progress.update,
-            "cpu_minutes": round(progress.cpu_seconds / 60.0, 2),
-            "best": best,
-        }
+        best, minutes = progress.best, progress.cpu_seconds / 60.0
+        summary = {"policy": trainer.policy, "seed": self.config.seed, "updates": progress.update}
+        summary |= {"cpu_minutes": round(minutes, 2), "best": best}
         write_text(self.out / "summary.json", json.dumps(summary, indent=2) + "\n")
         write_text(self.out / f"{trainer.policy}.md", self._model_card(summary))
         print(
             f"{trainer.policy}: success in {best['success']:.0%} of held-out {trainer.evaluated} "
-            f"after {best['update']} of {progress.update} updates, "
-            f"{progress.cpu_seconds / 60.0:.1f} CPU minutes; weights in "
-            f"{self.out / trainer.policy}.npz"
+            f"after {best['update']} of {progress.update} updates, {minutes:.1f} CPU minutes; "
+            f"weights in {self.out / trainer.policy}.npz"
         )
         return summary
 
@@ -207,10 +200,8 @@ class _Run:
         """Writes the weights as float32, or as the `weights_type` of their architecture."""
         trainer = self.trainer
         dtype = getattr(trainer.spec, "weights_type", np.float32)
-        weights = {
-            name: w.detach().cpu().numpy().astype(dtype)
-            for name, w in trainer.network.state_dict().items()
-        }
+        state = trainer.network.state_dict()
+        weights = {name: w.detach().cpu().numpy().astype(dtype) for name, w in state.items()}
         provenance = {
             "command": f"splatpilot train {trainer.policy}",
             "config": self.yaml,
@@ -222,15 +213,14 @@ class _Run:
         checkpoint.save(self.out / f"{trainer.policy}.npz")
 
     def _model_card(self, summary: dict[str, Any]) -> str:
-        policy, best = summary["policy"], summary["best"]
-        rows = "\n".join(
-            f"| {name} | {value:.2f} |" for name, value in best.items() if name != "update"
-        )
+        policy, best = summary["policy"], dict(summary["best"])
+        update = best.pop("update")
+        rows = "\n".join(f"| {name} | {value:.2f} |" for name, value in best.items())
         return f"""# {policy}
 
 Made by `splatpilot train {policy} --out DIR --config CONFIG` with the configuration below at
 revision {self.revision} of the source, in {summary["cpu_minutes"]:.1f} minutes of one core;
-{summary["updates"]} updates. The weights after {best["update"]} did best on held-out worlds.
+{summary["updates"]} updates. The weights after {update} did best on held-out worlds.
 
 | on held-out worlds | |
 |---|---|

@@ -68,20 +68,16 @@ class AgileAutonomyAgent:
 
     def encode_depth(self, depth: Tensor) -> Tensor:
         """Computes images (N, 24, 32) of depth (N, R) [m]."""
-        spec, image = (
-            self.network.spec,
-            1.0 / depth.clamp(agile_autonomy.MIN_DEPTH, agile_autonomy.MAX_DEPTH),
-        )
-        return image.reshape(-1, spec.image_height, spec.image_width)
+        image = 1.0 / depth.clamp(agile_autonomy.MIN_DEPTH, agile_autonomy.MAX_DEPTH)
+        return image.reshape(-1, *self.network.spec.image_size()[1:])
 
     def hypotheses(self, seen: vehicles.Observation) -> tuple[Tensor, Tensor]:
         """Computes waypoints (N, 3, 10, 3) [m] in the body frame and costs (N, 3) less progress."""
         image, state = self.observe(seen)
         waypoints, costs = self.network(image, state)
         ahead_B = torch.nn.functional.normalize(state[:, -3:], dim=1)
-        return waypoints, costs - agile_autonomy.PROGRESS * (
-            waypoints[:, :, -1] * ahead_B[:, None]
-        ).sum(2)
+        progress = (waypoints[:, :, -1] * ahead_B[:, None]).sum(2)
+        return waypoints, costs - agile_autonomy.PROGRESS * progress
 
     def decide(self, seen: vehicles.Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
         waypoints, costs = self.hypotheses(seen)
@@ -95,7 +91,6 @@ def _reach(p_WR: Tensor, vehicle: vehicles.Vehicle) -> Tensor:
 
 
 EPSILON = 0.05  # fraction of an expert's pull on the hypotheses that are not the closest to it
-
 _MAX_EXCESS = 1.5  # [s] of cost over the expert's best, of trajectories that are imitated
 
 
@@ -165,9 +160,8 @@ class AgileAutonomyTrainer(FlightTrainer):
         sample = {name: values[chosen] for name, values in data.items()}
         depth = noisy_depth(sample["depth"].float(), config.noise, self.generator)
         waypoints, costs = self.network(self.agent.encode_depth(depth), sample["state"])
-        errors = (10.0 / (3 * NUM_WAYPOINTS)) * (
-            sample["experts"][:, :, None] - waypoints[:, None]
-        ).square().sum((3, 4))  # (N, K, M)
+        errors = (sample["experts"][:, :, None] - waypoints[:, None]).square().sum((3, 4))
+        errors = (10.0 / (3 * NUM_WAYPOINTS)) * errors  # (N, K, M)
         pull = torch.full_like(errors, EPSILON / (agile_autonomy.MODES - 1))
         pull.scatter_(2, errors.argmin(2, keepdim=True), 1.0 - EPSILON)
         imitated = (pull * errors).sum(2) * sample["imitated"]
@@ -216,10 +210,9 @@ class AgileAutonomyTrainer(FlightTrainer):
             if ended.any():
                 new, flown = self._start(world, student)
                 vehicle = vehicles.choose_rows(ended, new, vehicle)
-                past = vehicles.History.start(
-                    new, config.noise, agile_autonomy.RATE, self.generator
-                ).past
-                history = history._replace(past=vehicles.choose_rows(ended, past, history.past))
+                start = vehicles.History.start(new, config.noise, self.agent.rate, self.generator)
+                past = vehicles.choose_rows(ended, start.past, history.past)
+                history = history._replace(past=past)
                 by_student = torch.where(ended, flown, by_student)
                 tracked = torch.where(ended[:, None, None], vehicle.p[:, None], tracked)
             history, R_WB = history.push(vehicle), vehicle.attitude()

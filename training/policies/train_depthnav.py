@@ -63,15 +63,13 @@ class DepthNavLearner:
 
     def __init__(self, loss: DepthNavLoss, device: torch.device | str = "cpu") -> None:
         spec = depthnav.DEPTHNAV_NETWORK
-        aspect = (depthnav.CAMERA_SIZE[1] / spec.image_height) / (
-            depthnav.CAMERA_SIZE[0] / spec.image_width
-        )
+        width, height = depthnav.CAMERA_SIZE
+        aspect = (height / spec.image_height) / (width / spec.image_width)
         self.rays = PixelRays.of(spec.image_width, spec.image_height, depthnav.FOV_X, aspect)
         self.network = TrainableNetwork(spec, head_scale=1.0).to(device)
         self._loss = loss
-        self._limits = torch.tensor(
-            depthnav.ACCELERATION_LIMITS, dtype=torch.float32, device=device
-        )
+        limits = depthnav.ACCELERATION_LIMITS
+        self._limits = torch.tensor(limits, dtype=torch.float32, device=device)
 
     def initial_memory(self, count: int) -> Tensor:
         """Returns the network's hidden states and the yaw of the start frame, NaN at first."""
@@ -87,9 +85,8 @@ class DepthNavLearner:
         v_target = target_velocity(vehicle.p, seen.p_WG, speed)
         q_SB = quaternion_from_rotation(R_WS.mT @ vehicle.attitude())
         state = torch.cat([_rows(vehicle.v, R_WS), q_SB, _rows(v_target, R_WS), speed[:, None]], 1)
-        output, hidden = self.network(
-            image.reshape(-1, spec.image_height, spec.image_width), state, memory[:, :-1]
-        )
+        image = image.reshape(-1, *spec.image_size()[1:])
+        output, hidden = self.network(image, state, memory[:, :-1])
         a_S = limit_smoothly(output[:, :3], self._limits)
         to_goal = torch.atan2(v_target[:, 1], v_target[:, 0]).detach()
         heading = to_goal + torch.pi * torch.tanh(output[:, 3] / torch.pi)
@@ -110,7 +107,7 @@ class DepthNavLearner:
 def quaternion_from_rotation(R: Tensor) -> Tensor:
     """Computes the quaternions (N, 4) wxyz, w >= 0, of rotations (N, 3, 3), differentiable, each
     from its largest component."""
-    m00, m11, m22 = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
+    m00, m11, m22 = R.diagonal(dim1=1, dim2=2).unbind(1)
     yz, zx, xy = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
     sxy, szx, syz = R[:, 1, 0] + R[:, 0, 1], R[:, 0, 2] + R[:, 2, 0], R[:, 2, 1] + R[:, 1, 2]
     candidates = torch.stack(

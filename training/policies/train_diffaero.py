@@ -73,9 +73,8 @@ class DiffAeroLearner:
         self.rays = PixelRays.of(spec.image_width, spec.image_height, diffaero.FOV_X)
         self.network = TrainableNetwork(spec).to(device)
         self._loss = loss
-        self._limits = torch.tensor(
-            diffaero.ACCELERATION_LIMITS, dtype=torch.float32, device=device
-        )
+        limits = diffaero.ACCELERATION_LIMITS
+        self._limits = torch.tensor(limits, dtype=torch.float32, device=device)
 
     def initial_memory(self, count: int) -> Tensor:
         return torch.zeros(count, self.network.spec.hidden_size, device=self._limits.device)

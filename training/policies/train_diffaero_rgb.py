@@ -70,8 +70,8 @@ from splatpilot.training.policies.rollouts import (
     RolloutTraining,
     Transitions,
 )
-from splatpilot.training.policies.student_data import CorpusTrainer
 from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroLoss
+from splatpilot.training.policies.train_student import CorpusTrainer
 from splatpilot.training.policies.trainer import CorpusTraining, Schedule
 from splatpilot.training.policies.training_worlds import WorldViews
 from splatpilot.training.policies.vehicles import Observation

@@ -140,9 +140,7 @@ class WorldBatch:
 
         lower_W = [world.lower_W for world in worlds]
         self.lower_W, self.upper_W = tensor(lower_W), tensor([world.upper_W for world in worlds])
-        self.p_WS, self.p_WG = (
-            tensor([getattr(world, name) for world in worlds]) for name in ("p_WS", "p_WG")
-        )
+        self.p_WS, self.p_WG = tensor([w.p_WS for w in worlds]), tensor([w.p_WG for w in worlds])
         self.views: Any = None  # of colors, see `WorldViews`
         self._surfaces = [world.surfaces for world in worlds]
         self.geometry: Geometry = MixedGeometry(self._surfaces)

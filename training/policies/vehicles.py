@@ -6,6 +6,7 @@ equations of `QuadrotorPlant` with `FlatnessController`.
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, Self
 
 import torch
@@ -176,10 +177,7 @@ class History(NamedTuple):
     ) -> Self:
         """Begins flights at `rate` [Hz], with states for the maximum age of images."""
         count, device = len(vehicle.p), generator.device
-
-        def uniform(*size: int) -> Tensor:
-            return torch.rand(*size, generator=generator, device=device)
-
+        uniform = partial(torch.rand, generator=generator, device=device)
         if noise.frame_rate:
             lower, upper = noise.frame_rate
             oldest = lookback(noise) / lower

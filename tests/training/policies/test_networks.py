@@ -12,13 +12,13 @@ from splatpilot.systems.policies.velocity import tracking_acceleration
 from splatpilot.systems.sensing.time_of_flight import equivalent_sensor, time_of_flight_grid
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 from splatpilot.training.policies import networks, train_depthnav
-from splatpilot.training.policies.student_data import encode_images
 from splatpilot.training.policies.train_agile_autonomy import AgileAutonomyAgent
 from splatpilot.training.policies.train_diffaero import (
     DiffAeroLearner,
     DiffAeroLoss,
     DiffAeroTofLearner,
 )
+from splatpilot.training.policies.train_student import encode_images
 from splatpilot.training.policies.vehicles import BodyRate, Observation
 
 P_WG = np.array([9.0, 2.0, 1.5])
@@ -134,7 +134,7 @@ def test_flight_computes_what_training_computes(observation, size):
         labels = (R_WB, R_WB.T @ v_WB, R_WB.T @ (p_WG - p_WB))
         state = student.encode_state(*(torch.tensor(x).float()[None] for x in labels), spec.reach)
         with torch.no_grad():
-            waypoints, costs = module(encode_images(image[None]), state)
+            waypoints, costs = module(encode_images(torch.from_numpy(image[None]).float()), state)
         state = QuadrotorState(p_WB, v_WB, rotation.ToQuaternion().wxyz(), still)
         found = student.plan(network, base.Observation(0.5, X_WB, state, p_WG, image))
         np.testing.assert_allclose(found.waypoints_B, waypoints[0], atol=1e-4)

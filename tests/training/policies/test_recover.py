@@ -15,9 +15,12 @@ from splatpilot.training.corpus.corpus import EXPERT, RECOVERY, Corpus, CorpusCo
 from splatpilot.training.corpus.expert import ExpertConfig
 from splatpilot.training.corpus.library import LibraryConfig
 from splatpilot.training.policies import recover as recovery
-from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
-from splatpilot.training.policies.train_student import StudentDepthTraining, StudentTrainer
+from splatpilot.training.policies.train_student import (
+    StudentData,
+    StudentDepthTraining,
+    StudentTrainer,
+)
 
 TINY = ["pretrained=false", "frozen=0", "held_out=0.5", "batch=2"]
 TINY += ["schedule.updates=2", "schedule.checkpoint_every=2"]
