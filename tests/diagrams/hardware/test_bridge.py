@@ -51,24 +51,21 @@ def forest():
 
 @pytest.mark.parametrize("name", ["planner", "diffaero", "diffaero_tof"])
 def test_the_two_halves_fly_as_the_whole(forest, name):
-    scenario = Scenario(timeout=1.2, policy=policy_named(name))
+    scenario = Scenario(timeout=1.0, policy=policy_named(name))
     whole = fly(BuildFlightDiagram(scenario, forest, camera=False))
     limits = FlightLimits(max_speed=20.0, max_tilt=1.5, deceleration=100.0, min_clearance=0.0)
-    halves = Halves(scenario, forest, failsafe=FailsafeConfig(limits=limits), tick=0.002)
-    halves.advance_to(1.2)
+    halves = Halves(scenario, forest, failsafe=FailsafeConfig(limits=limits), tick=0.0025)
+    halves.advance_to(1.0)
     np.testing.assert_allclose(halves.state()[:3], whole.states[-1, :3], atol=0.1)
-    assert np.linalg.norm(whole.states[-1, :3] - whole.states[0, :3]) > 0.5
-    mode, _, state_age, _, gaps, rejected, overruns = halves.out("status")
-    assert mode == status.FLYING
-    assert 0.0 <= state_age <= 0.02
-    assert (gaps, rejected, overruns) == (0, 0, 0)
+    assert np.linalg.norm(whole.states[-1, :3] - whole.states[0, :3]) > 0.4
+    mode, _, state_age, _, *counts = halves.out("status")
+    assert (mode, *counts) == (status.FLYING, 0, 0, 0) and 0.0 <= state_age <= 0.02
 
 
 def test_ports_are_those_of_the_flight_diagram(post_world):
     flight = BuildFlightDiagram(Scenario(), post_world, camera=False)
     hardware = BuildHardwareDiagram(Scenario(), post_world, lcm.LCM("memq://"))
-    ports = (flight.get_output_port(index) for index in range(flight.num_output_ports()))
-    for port in ports:
+    for port in (flight.get_output_port(index) for index in range(flight.num_output_ports())):
         if port.get_name() != "outcome" and not port.get_name().startswith("observation_"):
             assert hardware.GetOutputPort(port.get_name()).size() == port.size()
 
@@ -110,11 +107,8 @@ class Erratic(LeafSystem):
 @pytest.mark.parametrize(
     ("port", "raises", "updates"),
     [
-        ("acceleration", False, True),
-        ("velocity", False, True),
-        ("waypoint", False, True),
-        ("velocity", True, True),
-        ("velocity", True, False),
+        *((port, False, True) for port in ("acceleration", "velocity", "waypoint")),
+        *(("velocity", True, updates) for updates in (True, False)),
     ],
 )
 def test_a_policy_that_fails_ends_no_flight(post_world, caplog, port, raises, updates):
@@ -177,10 +171,9 @@ def test_a_policy_flies_by_the_grid_of_a_sensor(post_world, tmp_path):
 
 def test_plans_are_sent(post_world):
     halves = Halves(Scenario(policy=policy_named("planner")), post_world)
-    heard = []
-    decode = lcmt_trajectory_hypotheses.decode
+    heard, decode = [], lcmt_trajectory_hypotheses.decode
     halves.lcm.subscribe("TRAJECTORY_HYPOTHESES", lambda _, data: heard.append(decode(data)))
-    halves.advance_to(0.3)
+    halves.advance_to(0.2)
     while halves.lcm.handle_timeout(0):
         pass
     plan = halves.out("hypotheses")
@@ -201,23 +194,15 @@ def test_a_known_obstacle_is_not_flown_into(post_world, setpoints, speed):
 
 
 @pytest.mark.parametrize(
-    ("build", "given", "message"),
+    ("given", "message"),
     [
-        (
-            BuildHardwareDiagram,
-            {"scenario": Scenario(sensors={"down": OnboardCamera()})},
-            r"sensors must be left out, .* got down",
-        ),
-        (BuildHardwareDiagram, {"moving": object()}, "world post must be without moving"),
-        (BuildVehicleDiagram, {"moving": object()}, "world post must be without moving"),
-        (BuildHardwareDiagram, {"config": HardwareConfig(tick=0.0)}, r"tick must be in .* got 0.0"),
-        (
-            BuildHardwareDiagram,
-            {"lcm": DrakeLcm("memq://")},
-            "lcm must be a handle of the package lcm, .*DrakeLcm",
-        ),
+        ({"scenario": Scenario(sensors={"down": OnboardCamera()})}, "sensors must be .* got down"),
+        ({"moving": object()}, "world post must be without moving"),
+        ({"config": HardwareConfig(tick=0.0)}, r"tick must be in .* got 0.0"),
+        ({"lcm": DrakeLcm("memq://")}, "lcm must be a handle of the package lcm, .*DrakeLcm"),
     ],
 )
+@pytest.mark.parametrize("build", [BuildHardwareDiagram, BuildVehicleDiagram])
 def test_what_messages_cannot_carry_is_refused(post_world, build, given, message):
     transport, config = given.get("lcm", lcm.LCM("memq://")), given.get("config", HardwareConfig())
     world = dataclasses.replace(post_world, moving=given.get("moving"))
@@ -232,8 +217,7 @@ def test_images_of_another_size_are_rejected(post_world):
     halves = Halves(Scenario(policy=policy), post_world, vehicle=Scenario(policy=small))
     halves.advance_to(0.3)
     mode, _, state_age, image_age, _, rejected, _ = halves.out("status")
-    assert (mode, image_age, rejected) == (status.WAITING, np.inf, 5)
-    assert state_age < 0.04
+    assert (mode, image_age, rejected) == (status.WAITING, np.inf, 5) and state_age < 0.04
     assert not halves.heard
 
 
@@ -250,18 +234,14 @@ def test_two_processes_fly(udp_url, tmp_path):
     small = ["--set", "world.length=8", "--set", "world.width=6", "--seed", "2"]
     words = ["--lcm-url", udp_url, "--patience", "60", "--policy", "diffaero", *small]
     log = f"--log={tmp_path}/flight.lcm"
-    flies = subprocess.Popen(
-        [SPLATPILOT, "hardware", "vehicle", f"--out={tmp_path}/vehicle", *words]
-    )
-    try:
-        ended = subprocess.run(
-            [SPLATPILOT, "hardware", "bridge", log, *words], capture_output=True, text=True
-        )
-        assert flies.wait(60) == 0
-    finally:
-        flies.kill()
-    assert ended.returncode == 0, ended.stderr
-    assert "outcome        goal" in ended.stdout
+    command, out = [SPLATPILOT, "hardware"], f"--out={tmp_path}/vehicle"
+    with subprocess.Popen([*command, "vehicle", out, *words]) as flies:
+        try:
+            printed = subprocess.check_output([*command, "bridge", log, *words], text=True)
+            assert flies.wait(60) == 0
+        finally:
+            flies.kill()
+    assert "outcome        goal" in printed
     summary = json.loads((tmp_path / "vehicle" / "summary.json").read_text())
     assert summary["outcome"] == "goal"
     *_, last = (

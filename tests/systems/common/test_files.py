@@ -79,9 +79,8 @@ def test_folder_appears_when_the_block_ends(tmp_path):
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(errno.EIO, "input/output error")])
 def test_a_folder_is_kept_if_its_replacement_fails(tmp_path, monkeypatch, error):
-    path = tmp_path / "scene"
+    path, rename = tmp_path / "scene", Path.rename
     (path / "old").mkdir(parents=True)
-    rename = Path.rename
 
     def fail(self, target):
         if self.name.endswith(".partial"):
@@ -101,12 +100,12 @@ def test_a_folder_is_kept_if_its_replacement_fails(tmp_path, monkeypatch, error)
 
 
 def test_a_link_to_a_folder_stays_a_link(tmp_path):
-    (tmp_path / "disk/scene").mkdir(parents=True)
-    (tmp_path / "scene").symlink_to(tmp_path / "disk/scene")
-    with folder_written_atomically(tmp_path / "scene", replace=True) as folder:
-        (folder / "new").touch()
-    assert (tmp_path / "scene").is_symlink() and (tmp_path / "disk/scene/new").exists()
-    assert len(list(tmp_path.iterdir())) == 2
+    link, folder = tmp_path / "scene", tmp_path / "disk/scene"
+    folder.mkdir(parents=True)
+    link.symlink_to(folder)
+    with folder_written_atomically(link, replace=True) as partial:
+        (partial / "new").touch()
+    assert link.is_symlink() and (folder / "new").exists() and len(list(tmp_path.iterdir())) == 2
 
 
 def test_leftovers_of_ended_processes_are_removed(tmp_path):

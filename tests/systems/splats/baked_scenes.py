@@ -4,6 +4,9 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot import _native
+from splatpilot.systems.collision.shapes import MovingSpheres
+from splatpilot.systems.splats.baked_scene import MovingGaussians
+from splatpilot.systems.splats.moving_bodies import MovingObstacles
 from splatpilot.systems.splats.scene import GaussianScene
 
 LEVELS = _native.simd_levels()
@@ -38,6 +41,12 @@ def wall(axis: int, at: float, opacity: float = 0.99, reach: float = 30.0) -> Ga
     steps = np.arange(-reach, reach + 0.1, 0.5)
     means = np.insert(np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2), axis, at, axis=1)
     return uniform_scene(means, np.where(np.arange(3) == axis, 1e-3, 0.5), opacity, (1.0, 0.5, 0.0))
+
+
+def moving(gaussians: GaussianScene, path, period: float = 1.0, radius=0.5) -> MovingObstacles:
+    """An obstacle of Gaussians about its center that follows a path (n, 3) [m], a row a period."""
+    spheres = MovingSpheres([radius], [np.array(path)], period)
+    return MovingObstacles(spheres, MovingGaussians([gaussians], spheres.centers))
 
 
 def plane(X_WP: RigidTransform, half: float, step: float) -> GaussianScene:

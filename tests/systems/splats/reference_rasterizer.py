@@ -135,17 +135,21 @@ def pixel_centers(width: int, height: int) -> Tensor:
     return torch.stack([u, v], -1).reshape(-1, 1, 2).double()
 
 
+def blend(raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Transmittances before and after M Gaussians, and weights (P, M), of alphas not limited yet."""
+    alpha = torch.where(raw >= ALPHA_CUT, raw.clamp(max=MAX_ALPHA), 0.0)
+    after = torch.cumprod(1 - alpha, 1)
+    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
+    return before, after, torch.where(after > MIN_TRANSMITTANCE, alpha * before, 0.0)
+
+
 def composite(projection: Projection, colors: Tensor, width: int, height: int) -> Reference:
     """Front-to-back blending; `colors` (M, 3) in the projection's order."""
     conic = torch.linalg.inv(projection.covariance)
     d = pixel_centers(width, height) - projection.mean  # (P, M, 2)
     power = -0.5 * torch.einsum("pgi,gij,pgj->pg", d, conic, d)
     raw = projection.opacity * torch.exp(power)
-    alpha = torch.where(raw >= ALPHA_CUT, raw.clamp(max=MAX_ALPHA), 0.0)
-    after = torch.cumprod(1 - alpha, 1)
-    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
-    weight = torch.where(after > MIN_TRANSMITTANCE, alpha * before, 0.0)
-
+    before, after, weight = blend(raw)
     met = before > MIN_TRANSMITTANCE
     margins = torch.minimum((raw / ALPHA_CUT - 1).abs(), (after / MIN_TRANSMITTANCE - 1).abs())
     margin = torch.where(met, margins, torch.inf).amin(1)

@@ -9,6 +9,7 @@ from reference_rasterizer import (
     ALPHA_CUT,
     MAX_ALPHA,
     MIN_TRANSMITTANCE,
+    blend,
     first_view,
     pixel_centers,
     rotation_matrices,
@@ -65,11 +66,7 @@ def render(
     depth = torch.where(hit, z, p_C[:, 2])
 
     raw = opacity * torch.exp(-r2 / 2)
-    alpha = torch.where(raw >= ALPHA_CUT, raw.clamp(max=MAX_ALPHA), 0.0)
-    ones = torch.ones_like(x)
-    after = torch.cat([ones, torch.cumprod(1 - alpha, 1)], 1)
-    before, after = after[:, :-1], after[:, 1:]
-    weight = torch.where(after > MIN_TRANSMITTANCE, alpha * before, 0.0)
+    before, after, weight = blend(raw)
     front_weight = weight.cumsum(1) - weight
     front_depth = (weight * depth).cumsum(1) - weight * depth
     distort = 2 * (weight * (depth * front_weight - front_depth)).sum(1)
@@ -90,7 +87,7 @@ def render(
     margin = torch.stack(
         [torch.where(met, d.detach().abs(), torch.inf) for d, met in thresholds]
     ).amin(0)
-    margin = torch.cat([margin, torch.inf * ones], 1).amin(1)
+    margin = torch.cat([margin, torch.full_like(x, torch.inf)], 1).amin(1)
     total = weight.sum(1)
     behind = scene.get("backgrounds", torch.zeros(1, 3))[0].to(dtype)
     color = weight @ seen + (1 - total)[:, None] * behind

@@ -24,12 +24,12 @@ from splatpilot.systems.splats.baked_scene import (
     BakedScene,
     BatchRenderer,
     MovingGaussians,
-    PlacedGaussians,
     create_renderer,
+    placed_together,
 )
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 from splatpilot.systems.splats.rasterization import rasterize
-from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.scene import ARRAYS, GaussianScene
 
 CAMERA = K, WIDTH, HEIGHT
 LENSES = [None, Distortion("fisheye", [0.05, 0.0, 0.0, 0.0])]
@@ -110,9 +110,8 @@ def test_near_and_far_cut_by_depth_of_center():
     z = (X_WC.inverse() @ scene.means.T)[2]
     between = (z > 2.5) & (z < 3.0)
     assert 0 < between.sum() < len(scene)
-    arrays = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
-    alone = BakedScene(GaussianScene(*(a[between] for a in arrays))).render(*CAMERA, X_WC)
-    assert_equal_views(view, alone)
+    alone = GaussianScene(*(getattr(scene, name)[between] for name in ARRAYS))
+    assert_equal_views(view, BakedScene(alone).render(*CAMERA, X_WC))
     assert not baked.render(*CAMERA, X_WC, near=50.0).alpha.any()
 
 
@@ -159,8 +158,7 @@ def test_environment_selects_the_simd_level(monkeypatch):
 @pytest.mark.parametrize("size", [0.02, 1.0, 6.0])
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_depth_or_color_rendered_alone_is_identical(simd, lens, size, antialiased):
-    bodies = random_scene(count=200, seed=1, sh_degree=0)
-    moving = PlacedGaussians(*(getattr(bodies, name) for name in PlacedGaussians._fields))
+    moving = placed_together([random_scene(count=200, seed=1, sh_degree=0)])
     scene = replace(random_scene(count=3000), antialiased=antialiased)
     scene = BakedScene(replace(scene, scales=np.float32(size) * scene.scales), simd=simd)
     options = {"background": (0.1, 0.2, 0.3), "moving": moving, "distortion": lens}
@@ -197,21 +195,11 @@ def test_rows_are_those_of_the_whole_image(lens, sky):
         scene.render(*CAMERA, X_WC, rows=(3, HEIGHT + 1))
 
 
-def test_nothing_can_be_rendered_with_merged_neighbors():
-    nothing = BakedScene(random_scene(count=0))
-    assert not nothing.render_color(*CAMERA, X_WC, merged_spread=0.5).any()
-
-
 @pytest.mark.parametrize("simd", LEVELS)
 def test_gaussians_beyond_max_depth_hide_nothing(simd):
-    half = 0.5**0.5
-    scene = GaussianScene(
-        means=np.array([[0.0, 0.0, 6.0], [0.0, 2.0, 6.5]], np.float32),
-        quats=np.array([[1.0, 0.0, 0.0, 0.0], [half, half, 0.0, 0.0]], np.float32),
-        scales=np.array([[4.0, 4.0, 0.001], [1.75, 1.75, 0.001]], np.float32),
-        opacities=np.ones(2, np.float32),
-        sh=np.zeros((2, 1, 3), np.float32),
-    )
+    scales = np.array([[4.0, 4.0, 0.001], [1.75, 1.75, 0.001]])
+    quats = np.array([[1.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0]])
+    scene = uniform_scene([[0.0, 0.0, 6.0], [0.0, 2.0, 6.5]], scales, 1.0, quat=quats)
     baked = BakedScene(scene, simd=simd)
     floor = 2.0 / ((57.5 - 30.0) / 75.0)  # 2 m below, at the slope of row 57
     for max_depth, expected in ((5.6, floor), (7.0, 6.0)):
@@ -338,6 +326,7 @@ def test_recolored_scenes_keep_their_merged_neighbors():
         np.testing.assert_allclose(image + view.color, view.alpha[..., None] * [1, 1, 1], atol=1e-4)
 
 
-def test_few_gaussians_far_apart_do_not_merge():
-    scene = BakedScene(random_scene(count=130))
+@pytest.mark.parametrize("count", [0, 130])
+def test_few_gaussians_far_apart_do_not_merge(count):
+    scene = BakedScene(random_scene(count))
     assert_equal_views(*(scene.render(*CAMERA, X_WC, merged_spread=s) for s in (0.0, 1e-3)))

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from baked_scenes import wall
+from baked_scenes import moving, wall
 from pydrake.common.value import Value
 from pydrake.geometry import RenderLabel
 from pydrake.math import RigidTransform, RotationMatrix
@@ -13,10 +13,8 @@ from splatpilot.systems.collision.shapes import (
     AnalyticDistanceField,
     FieldWithSpheres,
     HalfSpace,
-    MovingSpheres,
 )
-from splatpilot.systems.splats.baked_scene import MovingGaussians
-from splatpilot.systems.splats.moving_bodies import Bodies, MovingBodies, MovingObstacles, Track
+from splatpilot.systems.splats.moving_bodies import Bodies, MovingBodies, Track
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_gaussians
@@ -26,21 +24,16 @@ INFO = CameraInfo(64, 48, 60.0, 60.0, 32.0, 24.0)
 FIELD = AnalyticDistanceField([HalfSpace([0, 0, 1], -50.0)], np.full(3, -60.0), np.full(3, 60.0))
 
 
-def obstacle(path: np.ndarray, radius: float = 0.5) -> MovingObstacles:
-    spheres = MovingSpheres([radius], [path], 1.0)
-    return MovingObstacles(spheres, MovingGaussians([quadrotor_gaussians()], spheres.centers))
-
-
 @pytest.fixture(scope="module")
 def evaluate():
     """Evaluates a port of a camera or a distance at the origin, with a body at a pose."""
     builder = DiagramBuilder()
-    moving = builder.AddSystem(MovingBodies())
+    others = builder.AddSystem(MovingBodies())
     camera = builder.AddSystem(SplatCamera(wall(0, 5.0, reach=20.0), INFO, RigidTransform(R_BC)))
     collision = builder.AddSystem(EsdfCollision(FIELD))
-    pose = moving.DeclareBody("other", quadrotor_gaussians(), VEHICLE_RADIUS)
+    pose = others.DeclareBody("other", quadrotor_gaussians(), VEHICLE_RADIUS)
     for system in (camera, collision):
-        builder.Connect(moving.moving_output_port(), system.GetInputPort("moving"))
+        builder.Connect(others.moving_output_port(), system.GetInputPort("moving"))
     builder.ExportInput(pose, "other")
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
@@ -90,26 +83,26 @@ class Flyby(LeafSystem):
 
 def test_poses_are_remembered_and_predicted():
     builder = DiagramBuilder()
-    source, moving = builder.AddSystem(Flyby()), builder.AddSystem(MovingBodies())
-    pose = moving.DeclareBody("other", quadrotor_gaussians(), 0.3)
+    source, others = builder.AddSystem(Flyby()), builder.AddSystem(MovingBodies())
+    pose = others.DeclareBody("other", quadrotor_gaussians(), 0.3)
     builder.Connect(source.get_output_port(), pose)
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(2.513)
-    context = moving.GetMyContextFromRoot(simulator.get_context())
-    bodies = moving.GetOutputPort("moving").Eval(context)
+    context = others.GetMyContextFromRoot(simulator.get_context())
+    bodies = others.GetOutputPort("moving").Eval(context)
     assert bodies.time == 2.513
     for time in (0.6, 1.333, 2.513, 3.7):
         np.testing.assert_allclose(bodies.centers(time), [[2.0 * time, 0.0, time]], atol=1e-9)
     np.testing.assert_array_equal(bodies.centers(-1.0), bodies.centers(0.0))
     for time in 0.1 * np.arange(1, 13) + 2.6:  # close to the times of samples, which are rounded
         simulator.AdvanceTo(time)
-        bodies = moving.GetOutputPort("moving").Eval(context)
+        bodies = others.GetOutputPort("moving").Eval(context)
         np.testing.assert_allclose(bodies.centers(5.0), [[10.0, 0.0, 5.0]], atol=1e-6)
 
 
 def test_obstacles_and_bodies_are_together():
-    obstacles = obstacle(np.array([[0.0, 3.0, 0.0], [1.0, 3.0, 0.0]]))
-    both = obstacles.merged_with(obstacle(np.array([[0.0, -3.0, 0.0]]), 0.25))
+    obstacles = moving(quadrotor_gaussians(), [[0.0, 3.0, 0.0], [1.0, 3.0, 0.0]])
+    both = obstacles.merged_with(moving(quadrotor_gaussians(), [[0.0, -3.0, 0.0]], radius=0.25))
     row = [0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
     bodies = Bodies(1.0, both, (Track(quadrotor_gaussians(), 0.3, np.array([row])),))
     np.testing.assert_array_equal(bodies.centers(1.0), [[1, 3, 0], [0, -3, 0], [1, 0, 0]])
@@ -123,11 +116,11 @@ def test_obstacles_and_bodies_are_together():
 
 
 def test_invalid_bodies_are_refused():
-    moving = MovingBodies()
-    moving.DeclareBody("a", quadrotor_gaussians(), 0.3)
+    others = MovingBodies()
+    others.DeclareBody("a", quadrotor_gaussians(), 0.3)
     for radius, message in ((-1, r"in \[0, inf\) m, got -1"), (0.3, "new among .* got 'a'")):
         with pytest.raises(ValueError, match=message):
-            moving.DeclareBody("a", quadrotor_gaussians(), radius)
+            others.DeclareBody("a", quadrotor_gaussians(), radius)
 
 
 def test_the_quadrotor_of_gaussians_fits_its_sphere():

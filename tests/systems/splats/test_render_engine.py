@@ -11,11 +11,10 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems import sensors
 from pydrake.systems.framework import DiagramBuilder
 
-from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.splats.background import EnvironmentMap
-from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians
+from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.lens import pixel_slopes
-from splatpilot.systems.splats.moving_bodies import Bodies, MovingObstacles
+from splatpilot.systems.splats.moving_bodies import Bodies
 from splatpilot.systems.splats.render_engine import (
     ObstacleGeometry,
     SplatRenderEngine,
@@ -262,9 +261,8 @@ def test_a_geometry_is_drawn_as_gaussians_at_its_pose():
 
 @pytest.mark.parametrize("time", [0.0, 3.0])
 def test_moving_obstacles_are_seen_as_by_a_splat_camera(time):
-    path = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 2.5], [0.0, 0.0, 3.0], [np.inf] * 3])
-    spheres = MovingSpheres([0.4], [path], 1.0)
-    obstacles = MovingObstacles(spheres, MovingGaussians([disc()], spheres.centers))
+    path = [[0.0, 0.0, 2.0], [0.0, 0.0, 2.5], [0.0, 0.0, 3.0], [np.inf] * 3]
+    obstacles = baked_scenes.moving(disc(), path, radius=0.4)
     scene, builder = baked_scenes.wall(2, 4.0), DiagramBuilder()
     scene_graph = builder.AddSystem(geometry.SceneGraph())
     scene_graph.AddRenderer("splats", SplatRenderEngine(scene))

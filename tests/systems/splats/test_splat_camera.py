@@ -13,13 +13,11 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
-from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.sensing.noise import light_of_color
 from splatpilot.systems.splats.background import EnvironmentMap
-from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians
+from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.lens import Distortion
-from splatpilot.systems.splats.moving_bodies import Bodies, MovingObstacles
-from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.moving_bodies import Bodies
 from splatpilot.systems.splats.splat_camera import SplatCamera, row_bands
 from splatpilot.systems.vehicle.state import pose_between
 
@@ -185,19 +183,10 @@ def test_bands():
 
 
 def test_a_rolling_shutter_changes_nothing_for_a_still_camera():
-    random = np.random.default_rng(0)
-    x, y = np.mgrid[0.5:8.0:0.25, -3.0:3.0:0.25].reshape(2, -1)
-    count = len(x)
-    floor = GaussianScene.from_colors(
-        np.column_stack([x, y, np.full(count, -1.0)]),
-        np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-        np.tile([0.2, 0.2, 0.002], (count, 1)),
-        np.full(count, 0.9),
-        random.uniform(size=(count, 3)),
-    )
-    X, bodies = RigidTransform(), Bodies(1.0)
-    whole = SplatCamera(BakedScene(floor), SHUTTER_INFO).render(X)
-    rows = SplatCamera(BakedScene(floor), SHUTTER_INFO, readout=0.02).render(X, bodies, X)
+    scene, X = BakedScene(baked_scenes.random_scene()), RigidTransform([0.0, 0.0, -3.0])
+    whole = SplatCamera(scene, SHUTTER_INFO).render(X)
+    rows = SplatCamera(scene, SHUTTER_INFO, readout=0.02).render(X, Bodies(1.0), X)
+    assert (whole.depth > 0).mean() > 0.2
     for one, other in zip(rows, whole, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
 
@@ -239,9 +228,8 @@ def test_invalid_arguments_are_named_at_construction(change, message):
 
 
 def test_a_moving_body_is_seen_at_the_time_of_each_row():
-    path = np.array([[0.002 * row, 0.0, 0.0] for row in range(1000)])
-    spheres = MovingSpheres([0.1], [path], 0.001)
-    obstacles = MovingObstacles(spheres, MovingGaussians([pole()], spheres.centers))
+    path = [[0.002 * row, 0.0, 0.0] for row in range(1000)]
+    obstacles = baked_scenes.moving(pole(), path, 0.001)
     camera = SplatCamera(BakedScene(pole(50.0)), SHUTTER_INFO, readout=0.2)
     view = camera.render(RigidTransform(), Bodies(0.5, obstacles), RigidTransform())
     times = np.interp(np.arange(HEIGHT) + 0.5, [0, HEIGHT], [0.3, 0.5])
@@ -289,8 +277,7 @@ def test_image_time_is_that_of_the_capture(latency, time, taken):
 
 
 def test_late_images_show_bodies_where_they_were():
-    spheres = MovingSpheres([0.5], [np.array([[1.0, 0, 0], [2.0, 0, 0], [3.0, 0, 0]])], 1.0)
-    obstacles = MovingObstacles(spheres, MovingGaussians([pole(-2.0)], spheres.centers))
+    obstacles = baked_scenes.moving(pole(-2.0), [[1.0, 0, 0], [2.0, 0, 0], [3.0, 0, 0]])
     late, prompt = (SplatCamera(wall(5.0), SHUTTER_INFO, latency=t) for t in (1.0, 0.0))
     for time, then in ((0.5, 0.0), (1.5, 0.5), (2.5, 1.5)):
         expected = prompt.render(RigidTransform(), Bodies(then, obstacles)).color
