@@ -136,7 +136,7 @@ def pixel_centers(width: int, height: int) -> Tensor:
 
 
 def blend(raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Transmittances before and after M Gaussians, and weights (P, M), of alphas not limited yet."""
+    """Transmittances before and after M Gaussians, and weights (P, M), of unlimited alphas."""
     alpha = torch.where(raw >= ALPHA_CUT, raw.clamp(max=MAX_ALPHA), 0.0)
     after = torch.cumprod(1 - alpha, 1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
