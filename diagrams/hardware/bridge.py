@@ -111,11 +111,9 @@ def BuildHardwareDiagram(
     if can_be_triggered(policy):
         policy = ArrivalTriggered(policy, config.tick)
     else:
-        name = type(policy).__name__
         _log.warning(
-            "%s has state, updates or outputs other than discrete state of one period and vectors: "
-            "it does not wait for images, and its exceptions end the bridge",
-            name,
+            f"{type(policy).__name__} has state, updates or outputs other than discrete state of "
+            "one period and vectors: it waits for no images, and its exceptions end the bridge"
         )
     decided, failed, heading, plans = (
         policy.GetOutputPort(name) if policy.HasOutputPort(name) else None

@@ -9,7 +9,7 @@ import numpy as np
 from lcm import LCM
 from pydrake.systems import primitives
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
-from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from splatpilot.diagrams.flight import blocks
 from splatpilot.diagrams.flight.monitor import AddLogs, Outcome, flight_outcome, has_landed
@@ -72,7 +72,15 @@ def BuildVehicleDiagram(
     hover = [0.0, 0.0, 0.0, np.nan] if by_velocity else [scenario.vehicle.gravity, 0.0, 0.0, 0.0]
     subscriber = ports.subscribe(codec, np.array(hover), "command")
     received, command_age = subscriber.GetOutputPort(codec.port), subscriber.GetOutputPort("age")
-    command = _AddVelocityControl(ports, scenario, state, received) if by_velocity else received
+    command = received
+    if by_velocity:
+        parts = ports.add("setpoint", primitives.Demultiplexer([3, 1]), u0=received)
+        velocity, heading = parts.get_output_port(0), parts.get_output_port(1)
+        tracker = ports.add("velocity_tracker", VelocityTracker(), state=state, velocity=velocity)
+        controller = FlatnessController(scenario.controller, scenario.vehicle)
+        acceleration = tracker.GetOutputPort("acceleration")
+        sources = {"state": state, "acceleration": acceleration, "heading": heading}
+        command = ports.add("controller", controller, **sources).GetOutputPort("command")
     limits = FlightLimits(max_speed=config.failsafe.limits.max_speed)
     autopilot = FailsafeConfig(max_age=SILENCE, recovery=config.tick, limits=limits)
     model, box = (scenario.controller, scenario.vehicle), np.full(3, np.inf)
@@ -122,27 +130,12 @@ def BuildVehicleDiagram(
     return diagram
 
 
-def _AddVelocityControl(
-    ports: MessagePorts, scenario: Scenario, state: OutputPort, setpoint: OutputPort
-) -> OutputPort:
-    """Adds the control of velocity setpoints; returns its commands."""
-    parts = ports.add("setpoint", primitives.Demultiplexer([3, 1]), u0=setpoint)
-    velocity, heading = parts.get_output_port(0), parts.get_output_port(1)
-    tracker = ports.add("velocity_tracker", VelocityTracker(), state=state, velocity=velocity)
-    acceleration = tracker.GetOutputPort("acceleration")
-    controller = FlatnessController(scenario.controller, scenario.vehicle)
-    sources = {"state": state, "acceleration": acceleration, "heading": heading}
-    return ports.add("controller", controller, **sources).GetOutputPort("command")
-
-
 @locks_folder("out")
 def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, float | str]:
     """Hovers at the scenario's start and flies by commands until the flight ends.
 
     Writes the files of `write_flight` and `write_summary` into `out`. Time begins with the first
-    command.
-
-    Returns `Flight.summary()` and `overruns`, of ticks.
+    command. Returns `Flight.summary()` and `overruns`, of ticks.
     """
     scenario.validate()
     config.validate()
@@ -179,19 +172,12 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     print(f"Hovering at {config.url} until commands come...", flush=True)
     started = time.monotonic()
     overruns = run_in_real_time(simulator, diagram, config.tick, over)
-    wall_time = time.monotonic() - started
+    wall_time = time.monotonic() - started - took_off
     diagram.ForcedPublish(root)  # The bridge needs the last state too.
-    ended = outcome() or Outcome.TIMEOUT
-    flight = record_flight(diagram, root, ended, wall_time)
-    rows = flight.times >= took_off
-    flight = dataclasses.replace(
-        flight,
-        times=flight.times[rows] - took_off,
-        states=flight.states[rows],
-        commands=flight.commands[rows],
-        clearances=flight.clearances[rows],
-        wall_time=flight.wall_time - took_off,
-    )
+    flight = record_flight(diagram, root, outcome() or Outcome.TIMEOUT, wall_time)
+    names, rows = ("times", "states", "commands", "clearances"), flight.times >= took_off
+    flight = dataclasses.replace(flight, **{name: getattr(flight, name)[rows] for name in names})
+    flight.times[:] -= took_off
     write_flight(out, scenario, flight)
     summary = flight.summary() | {"overruns": overruns}
     write_summary(out, summary)
