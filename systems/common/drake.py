@@ -90,6 +90,9 @@ def connect(builder: DiagramBuilder, source: OutputPort, target: InputPort) -> N
     builder.Connect(source, target)
 
 
+_IMAGES = "ImageDepth16U", "ImageDepth32F", "ImageLabel16I", "ImageRgb8U", "ImageRgba8U"
+
+
 def _content(port: InputPort | OutputPort) -> tuple[str, tuple[int, ...]]:
     """Returns the type and size of a port's vector or image; of other values nothing."""
     if port.get_data_type() == PortDataType.kVectorValued:
@@ -99,8 +102,8 @@ def _content(port: InputPort | OutputPort) -> tuple[str, tuple[int, ...]]:
     else:
         value = cast(Any, port.get_system()).AllocateInputAbstract(port)
     image: Any = value.get_value() if hasattr(value, "get_value") else None
-    name = type(image).__name__
-    return (name, (image.width(), image.height())) if hasattr(sensors, name) else ("", ())
+    names = [name for name in _IMAGES if type(image) is getattr(sensors, name)]
+    return (names[0], (image.width(), image.height())) if names else ("", ())
 
 
 def _describe(port: InputPort | OutputPort) -> str:
