@@ -24,7 +24,7 @@ from splatpilot.systems.splats.scene import color_to_sh, rotated_sh
 type Arrays = dict[str, NDArray[Any]]
 """The arrays of `GaussianScene`, in its order, as a file holds them, not checked yet."""
 
-_MIN_OPACITY = 1e-6  # of an opacity that a format rounds to 0
+MIN_OPACITY = 1e-6  # of an opacity that a format rounds to 0
 
 
 def insert_largest(small: NDArray, index: NDArray) -> NDArray[np.float64]:
@@ -44,25 +44,19 @@ def moved(arrays: Arrays, X: NDArray[np.float64]) -> Arrays:
         return arrays
     require(np.linalg.det(M) > 0, "a transform of Gaussians", "one without mirroring", M.tolist())
     U, stretch, V = np.linalg.svd(M)
-    turn = U @ V
-    known = np.isfinite(arrays["quats"]).all(axis=1) & arrays["quats"].any(axis=1)
-    known &= np.isfinite(arrays["scales"]).all(axis=1)
-    R = Rotation.from_quat(arrays["quats"][known], scalar_first=True).as_matrix()
+    turn, quats, scales = U @ V, arrays["quats"], arrays["scales"]
+    known = np.isfinite(quats).all(axis=1) & quats.any(axis=1) & np.isfinite(scales).all(axis=1)
+    R, sizes = Rotation.from_quat(quats[known], scalar_first=True).as_matrix(), scales[known]
     if np.ptp(stretch) < 1e-5 * stretch[0]:
-        R, scales = turn @ R, stretch.mean() * arrays["scales"][known]
+        R, sizes = turn @ R, stretch.mean() * sizes
     else:
-        R, scales, _ = np.linalg.svd(M @ (R * arrays["scales"][known][:, None, :]))
+        R, sizes, _ = np.linalg.svd(M @ (R * sizes[:, None, :]))
         R[:, :, 2] *= np.linalg.det(R)[:, None]
-    quats = np.full(arrays["quats"].shape, np.nan)  # invalid ones are dropped
-    quats[known] = Rotation.from_matrix(R).as_quat(scalar_first=True)
-    all_scales = np.full(arrays["scales"].shape, np.nan)
-    all_scales[known] = scales
-    return arrays | {
-        "means": arrays["means"] @ M.T + X[:3, 3],
-        "quats": quats,
-        "scales": all_scales,
-        "sh": rotated_sh(arrays["sh"], turn),
-    }
+    # Invalid ones are dropped later.
+    quats, scales = (np.full(array.shape, np.nan) for array in (quats, scales))
+    quats[known], scales[known] = Rotation.from_matrix(R).as_quat(scalar_first=True), sizes
+    means, sh = arrays["means"] @ M.T + X[:3, 3], rotated_sh(arrays["sh"], turn)
+    return arrays | {"means": means, "quats": quats, "scales": scales, "sh": sh}
 
 
 # PlayCanvas's compressed PLY: vertices are four words of 32 bits. Each 256 share a row of the
@@ -121,7 +115,7 @@ def unpack_ply(ply: PlyData) -> Arrays:
         "means": between("", "xyz", _fields(position, *three)),
         "quats": insert_largest(small, (rotation >> 30).astype(int)),
         "scales": np.exp(between("_scale", "xyz", _fields(scale, *three))),
-        "opacities": np.maximum(_bits(color, 0, 8), _MIN_OPACITY),
+        "opacities": np.maximum(_bits(color, 0, 8), MIN_OPACITY),
         "sh": sh,
     }
 
@@ -195,7 +189,7 @@ def unpack_spz(path: Path) -> tuple[Arrays, bool]:
         "means": fixed / 2.0**bits,
         "quats": np.roll(quats, 1, axis=1),  # from x y z w
         "scales": np.exp(scale / 16 - 10),
-        "opacities": np.maximum(opacity[:, 0] / 255, _MIN_OPACITY),
+        "opacities": np.maximum(opacity[:, 0] / 255, MIN_OPACITY),
         "sh": np.concatenate([first, higher], axis=1),
     }
     return arrays, bool(flags & _ANTIALIASED)
@@ -323,7 +317,7 @@ def _unpack_images(path: Path, text: str, read: Callable[[str], bytes]) -> tuple
                 (rotation[:, :3] / 127.5 - 1) * np.sqrt(0.5), rotation[:, 3].clip(252) - 252
             ),
             "scales": np.exp(decode("scales", each("scales")[:, :3])),
-            "opacities": np.maximum(opacity, _MIN_OPACITY),
+            "opacities": np.maximum(opacity, MIN_OPACITY),
             "sh": sh,
         }
     model = meta.get("model") or meta.get("antialias")

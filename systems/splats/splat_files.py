@@ -23,6 +23,7 @@ from splatpilot.systems.splats.gltf_usd import unpack_gltf, unpack_usd, write_gl
 from splatpilot.systems.splats.packed_splats import (
     GZIP,
     MAGIC,
+    MIN_OPACITY,
     PACKED,
     SOG_META,
     Arrays,
@@ -37,7 +38,6 @@ from splatpilot.systems.splats.scene import ARRAYS, GaussianScene, choose_origin
 _log = logging.getLogger(__name__)
 
 _MAX_INVALID = 0.2  # fraction of invalid Gaussians that are dropped instead of refusing the file
-_MIN_OPACITY = 1e-6  # of an opacity that a format rounds to 0
 _EXPORT = "export the scene in the layout of 3D Gaussian splatting"
 
 
@@ -97,8 +97,6 @@ _INVISIBLE_LOGIT = -87.0  # below, the opacity is not a normal float32
 
 def read_ply(path: str | Path, recenter: bool = False) -> GaussianScene:
     """Reads the Gaussians of a PLY file: binary of either byte order, ASCII, or compressed.
-
-    Surfels, whose files have two scales (2DGS), get a third of `_THICKNESS` times the smaller one.
 
     Raises FileNotFoundError, or ValueError for a file that is damaged or without Gaussians.
     """
@@ -204,11 +202,10 @@ _RECORD = np.dtype([("p", "<f4", 3), ("s", "<f4", 3), ("rgba", "u1", 4), ("q", "
 
 
 def read_splats(path: str | Path) -> GaussianScene:
-    """Reads the Gaussians of a file; for errors see `read_ply`.
+    """Reads the Gaussians of a file, or of a folder of an unbundled SOG; for errors see `read_ply`.
 
     Axes are those of the file, of SPZ those of its PLY. glTF and USD, which say what is up, are
-    converted to z up, and USD to meters. A folder of an unbundled SOG is named itself, or by its
-    `meta.json`.
+    converted to z up, and USD to meters.
     """
     path = sog_meta(Path(path)) or Path(path)
     require_file(path)
@@ -254,15 +251,10 @@ def _read_records(path: Path) -> GaussianScene:
         "means": records["p"],
         "quats": (records["q"].astype(float) - 128) / 128,
         "scales": records["s"],
-        "opacities": np.maximum(color[:, 3], _MIN_OPACITY),
+        "opacities": np.maximum(color[:, 3], MIN_OPACITY),
         "sh": color_to_sh(color[:, :3])[:, None, :],
     }
     return _drop_invalid(path, arrays)
-
-
-def _write_gltf(scene: GaussianScene, path: Path) -> None:
-    """Writes a scene as glTF, with y up."""
-    write_gltf(scene.transformed_by(_X_WG.inverse()), path)
 
 
 def _write_spz(scene: GaussianScene, path: Path) -> None:
@@ -278,7 +270,10 @@ def _write_spz(scene: GaussianScene, path: Path) -> None:
 _WRITERS: dict[str, Callable[[GaussianScene, Path], None]] = {
     ".ply": write_ply,
     ".spz": _write_spz,
-    **dict.fromkeys((".gltf", ".glb"), _write_gltf),
+    **dict.fromkeys(
+        (".gltf", ".glb"),
+        lambda scene, path: write_gltf(scene.transformed_by(_X_WG.inverse()), path),
+    ),
     **dict.fromkeys(_USD[:3], write_usd),
 }
 WRITTEN = tuple(_WRITERS)

@@ -94,7 +94,9 @@ class RerunSink(LeafSystem):
                 self.DeclareAbstractInputPort(name, port.Allocate())
         self._path = path
         self._recording: Any = None
-        self._statics: list[tuple[str, Any]] = []
+        self._statics = [
+            (curve, self._rr.SeriesLines(names=names)) for curve, names in _CURVES.items()
+        ]
         if gaussians is not None:
             self._statics.append(("world/splats", self._splats(gaussians)))
         if goal is not None:
@@ -105,8 +107,6 @@ class RerunSink(LeafSystem):
             half_sizes=radii, colors=[255, 120, 0], fill_mode="solid", labels="vehicle"
         )
         self._statics.append(("world/vehicle", vehicle))
-        for curve, names in _CURVES.items():
-            self._statics.append((curve, self._rr.SeriesLines(names=names)))
         self.DeclareInitializationPublishEvent(self._begin)
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
@@ -138,11 +138,10 @@ class RerunSink(LeafSystem):
 
     def show_camera(self, info: CameraInfo, X_BC: RigidTransform) -> None:
         """Records the intrinsics of the camera and its pose in the vehicle's body frame."""
-        q_BC = X_BC.rotation().ToQuaternion().wxyz()
-        self._statics.append((_CAMERA, self._transform(X_BC.translation(), q_BC)))
-        resolution = [info.width(), info.height()]
-        pinhole = self._rr.Pinhole(image_from_camera=info.intrinsic_matrix(), resolution=resolution)
-        self._statics.append((_CAMERA, pinhole))
+        q_BC, size = X_BC.rotation().ToQuaternion().wxyz(), [info.width(), info.height()]
+        pinhole = self._rr.Pinhole(image_from_camera=info.intrinsic_matrix(), resolution=size)
+        transform = self._transform(X_BC.translation(), q_BC)
+        self._statics += [(_CAMERA, transform), (_CAMERA, pinhole)]
 
     def close(self) -> None:
         """Completes the file; the sink records no more."""

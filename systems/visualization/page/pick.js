@@ -3,11 +3,7 @@
 "use strict";
 
 // The floats whose halves are 0 to 65535.
-const halves = Float32Array.from({length: 1 << 16}, (_, bits) => {
-  const sign = bits >> 15 ? -1 : 1, exponent = (bits >> 10) & 31, fraction = bits & 1023;
-  if (exponent === 31) return fraction ? NaN : sign * Infinity;
-  return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : fraction * 2 ** -24);
-});
+const halves = Float32Array.from({length: 1 << 16}, (_, bits) => THREE.DataUtils.fromHalfFloat(bits));
 
 // Whether the shader leaves out a Gaussian with this mean and these variances.
 function beyond([x, y, z], [xx, yy, zz], lower, upper) {
