@@ -81,8 +81,7 @@ class Observations:
         cosine = ray @ _UNIT.T / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
         allowed = ((cosine >= _MIN_COSINE) * _FLAGS).sum(axis=1, dtype=np.uint32)
         keys, directions = self._dilated
-        key = _key(np.floor(p_WQ / self.voxel_size).astype(np.int64))
-        return (_look_up(keys, directions, key) & allowed) != 0
+        return (_look_up(keys, directions, _keys_at(p_WQ, self.voxel_size)) & allowed) != 0
 
     @cached_property
     def _keys(self) -> NDArray[np.int64]:
@@ -99,8 +98,8 @@ class Observations:
 
     def with_surfaces(self, p_WQ: NDArray[np.float64]) -> "Observations":
         """Returns the voxels and those of points (N, 3) [m], which are seen from all directions."""
-        added = np.unique(np.floor(p_WQ / self.voxel_size).astype(np.int64), axis=0)
-        key, order, counts = _grouped([self._keys, _key(added)])
+        added = np.unique(_keys_at(p_WQ, self.voxel_size))
+        key, order, counts = _grouped([self._keys, added])
         seen = np.concatenate([self.counts, np.ones(len(added), np.uint16)])[order]
         directions = np.concatenate([self.directions, np.full(len(added), _FLAGS.sum(), np.uint32)])
         return replace(
@@ -116,7 +115,7 @@ class Observations:
         return Observations(size, self.voxels, self.counts, self.directions)
 
     def save(self, path: str | Path) -> None:
-        """Writes the voxels to `path`, by custom `observations.npz`, atomically."""
+        """Writes the voxels, by custom `observations.npz`, atomically."""
         with written_atomically(Path(path)) as partial, partial.open("wb") as file:
             np.savez_compressed(
                 file,
@@ -174,16 +173,13 @@ def _seen_voxels(
     """Returns the keys (V,) of the voxels of surfaces in every `step`-th pixel of an image, and
     p_QC (V, 3) [m], the camera seen from their centers."""
     p_WQ, _ = _points(depth, K, X_WC, step, far)
-    key = np.unique(_key(np.floor(p_WQ / voxel_size).astype(np.int64)))
+    key = np.unique(_keys_at(p_WQ, voxel_size))
     return key, X_WC.translation() - voxel_size * (_voxel(key) + 0.5)
 
 
 class ConfirmedSurfaces:
-    """Surfaces that several images show in the same voxel, from different directions.
-
-    Photographs determine no depth of what is seen once, or from one direction: it may be rendered
-    too far away, and the space before it is not known to be free.
-    """
+    """Surfaces that several images show in the same voxel, from different directions: what is seen
+    once, or from one direction, may be rendered too far away."""
 
     def __init__(
         self,
@@ -210,8 +206,8 @@ class ConfirmedSurfaces:
     def keep(self, depth: np.ndarray, X_WC: RigidTransform) -> NDArray[np.float32]:
         """Returns a depth image (H, W) [m] that is 0 at other surfaces; infinity stays."""
         p_WQ, known = _points(depth, self._K, X_WC, 1, self._far)
-        key = _key(np.floor(p_WQ / self._voxel_size).astype(np.int64))
-        confirmed = _look_up(self._keys, np.ones(len(self._keys), dtype=bool), key)
+        every = np.ones(len(self._keys), dtype=bool)
+        confirmed = _look_up(self._keys, every, _keys_at(p_WQ, self._voxel_size))
         kept = np.where(np.isinf(depth), depth, 0.0).astype(np.float32)
         kept[known] = depth[known] * confirmed
         return kept
@@ -221,6 +217,10 @@ def _key(voxel: NDArray) -> NDArray[np.int64]:
     """Packs indices (..., 3) into integers of the same order."""
     shifted = voxel + (1 << (_BITS - 1))
     return (shifted[..., 0] << 2 * _BITS) | (shifted[..., 1] << _BITS) | shifted[..., 2]
+
+
+def _keys_at(p_WQ: NDArray[np.float64], voxel_size: float) -> NDArray[np.int64]:
+    return _key(np.floor(p_WQ / voxel_size).astype(np.int64))
 
 
 def _voxel(key: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -286,9 +286,8 @@ def hidden_frontier(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], bool]:
     """Finds the unknown space at the edge of `reachable` voxels (nx, ny, nz) that no image crossed.
 
-    It begins two voxels behind the last one seen free, where an obstacle hides nothing captured.
-    Before the sky, and before surfaces beyond the field's range, space is unknown only because it
-    is far away: an obstacle there would hide them.
+    It begins two voxels behind the last one seen free, where an obstacle hides nothing captured,
+    and not before the sky and surfaces beyond the field's range.
 
     Returns the first hidden voxels (nx, ny, nz), the voxels (nx, ny, nz) before them, and True if
     the frontier was left open before a surface.
@@ -312,10 +311,8 @@ def hidden_frontier(
 def _pixel_values(
     p_WQ: np.ndarray, image: np.ndarray, K: np.ndarray, X_WC: RigidTransform
 ) -> NDArray[np.float64]:
-    """Returns the pixels (N,) of an image (H, W) that see points (N, 3) [m]; NaN beyond its inside.
-
-    At the border rounding would decide.
-    """
+    """Returns the pixels (N,) of an image (H, W) that see points (N, 3) [m]; NaN beyond its inside:
+    at its border rounding would decide."""
     p_CQ = (p_WQ - X_WC.translation()) @ X_WC.rotation().matrix()
     ahead = np.flatnonzero(p_CQ[:, 2] > 0.0)
     x, y, _ = (p_CQ[ahead] / p_CQ[ahead, 2:]).T

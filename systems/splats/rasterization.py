@@ -37,25 +37,18 @@ def named_tensors(*tensors: Tensor | None, sh_degree: int | None) -> dict[str, T
     require(sh_degree in (None, 0, 1, 2, 3), "sh_degree", "0, 1, 2, 3 or None", sh_degree)
     N, C = (given[n].shape[0] if given[n].ndim else 0 for n in ("means", "viewmats"))
     color = (3,) if sh_degree is None else ("K", 3)
-    allowed: dict[str, tuple[tuple[int | str, ...], ...]] = {
-        "means": ((N, 3),),
-        "quats": ((N, 4),),
-        "scales": ((N, 3),),
-        "opacities": ((N,),),
-        "colors": ((N, *color), (C, N, *color)),
-        "viewmats": ((C, 4, 4),),
-        "Ks": ((C, 3, 3),),
-        "backgrounds": ((C, 3),),
-    }
+    gaussians: list[tuple[int | str, ...]] = [(N, 3), (N, 4), (N, 3), (N,), (N, *color)]
+    shapes = dict(zip(TENSORS, [*gaussians, (C, 4, 4), (C, 3, 3), (C, 3)], strict=True))
     device = given["means"].device
     for name, tensor in given.items():
+        allowed = [shapes[name], *([(C, *shapes[name])] if name == "colors" else [])]
         fits = any(
             len(shape) == tensor.ndim
             and all(n in (have, "K") for n, have in zip(shape, tensor.shape, strict=True))
-            for shape in allowed[name]
+            for shape in allowed
         )
-        shapes = " or ".join("(" + ", ".join(map(str, s)) + ")" for s in allowed[name])
-        require(fits, name, f"of shape {shapes}", tuple(tensor.shape))
+        listed = " or ".join("(" + ", ".join(map(str, shape)) + ")" for shape in allowed)
+        require(fits, name, f"of shape {listed}", tuple(tensor.shape))
         require(tensor.dtype == torch.float32, name, "torch.float32", tensor.dtype, "use .float()")
         require(tensor.device == device, name, f"on {device} like means", tensor.device)
     require(C > 0, "viewmats", "of at least one camera", "none")
@@ -112,10 +105,8 @@ class Views:
     def project_backward(
         self, inputs: Sequence[Tensor], backward: Callable[..., NDArray[np.float64]]
     ) -> list[Tensor]:
-        """Returns the gradients of `inputs`: means, quats, scales, opacities, colors and viewmats.
-
-        `backward` takes a camera's index, its Gaussians and their gradients.
-        """
+        """Returns the gradients of `inputs`: means, quats, scales, opacities, colors and viewmats;
+        `backward` takes a camera's index, its Gaussians and their gradients."""
         results = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs]
         results[-1].zero_()
         scene, gradients = (
@@ -152,12 +143,8 @@ def prepare(
     scale_axes: int = 3,
     **optics: Any,
 ) -> tuple[Views, Arrays]:
-    """Checks the values of `named_tensors` on the CPU; returns cameras and arrays.
-
-    Args:
-        scale_axes: number of scales of a Gaussian that matter.
-        optics: arguments of `_native.Camera` but K and X_CW.
-    """
+    """Checks the values of `named_tensors` on the CPU; returns cameras and arrays. The first
+    `scale_axes` scales matter; `optics` are arguments of `_native.Camera` but K and X_CW."""
     size = optics["width"], optics["height"], optics["near_plane"], optics["far_plane"]
     radius_clip, device = optics["radius_clip"], tensors["means"].device
     require(device.type == "cpu", "the device", "'cpu' or 'cuda'", device, "move the tensors")
@@ -218,9 +205,8 @@ def over_backgrounds(
 
 
 # The native renderer draws the whole image at once. `Project` then maps the scene to `means2d`, and
-# `Composite` maps `means2d` to the image, so that screen-space gradients, by which scenes are
-# densified, are those of an ordinary intermediate tensor. Results come in tuples: autograd would
-# alias tensors that are inputs.
+# `Composite` maps `means2d` to the image, so that screen-space gradients are those of an ordinary
+# tensor. Results come in tuples: autograd would alias tensors that are inputs.
 
 
 def _pair_rows(frames: Sequence[_native.Frame]) -> list[slice]:

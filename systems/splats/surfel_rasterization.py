@@ -119,10 +119,8 @@ def rasterize_surfels(
 
     A surfel is a Gaussian on the plane through its mean spanned by the first two columns of its
     rotation. One smaller than a pixel or seen edge-on is a blob of sqrt(1/2) px at the depth of the
-    mean. Blending is that of `rasterize`, in the order of the means' depths.
-
-    Depths are those at which rays meet the surfels, as in the paper; gsplat blends the depths of
-    the means. Rays that meet a surfel nearer than `near_plane` miss it.
+    mean. Blending is that of `rasterize`, in the order of the means' depths. Depths are those at
+    which rays meet the surfels, not nearer than `near_plane`; gsplat blends those of the means.
 
     Args: as for `rasterize`; the third of the scales does not matter. Further:
         distloss: if true, renders the distortion; needs a `render_mode` with depth, as gsplat.
@@ -186,8 +184,7 @@ def rasterize_surfels(
     if with_depth:
         surface = depth_to_normals(expected if depth_mode == "expected" else median, viewmats, Ks)
     parts = [color] if "RGB" in render_mode else []
-    if with_depth:
-        parts.append(expected if "ED" in render_mode else depth)
+    parts += [expected if "ED" in render_mode else depth] if with_depth else []
     image = over_backgrounds(backgrounds, torch.cat(parts, -1), alpha, render_mode)
     ids, radii, means2d, depths, normals = joined(projected)
     meta = pair_meta([len(of_camera[0]) for of_camera in projected], width, height) | {
@@ -203,11 +200,8 @@ def rasterize_surfels(
 
 
 def _rasterize_by_gsplat(*scene: Tensor, **options: Any) -> tuple[Any, ...]:
-    """Returns the results of `rasterize_surfels` without backgrounds.
-
-    gsplat 1.5.3 fails on backgrounds of colors with depth, gives meta of invisible pairs too, and
-    surface normals of one camera without the camera's dimension.
-    """
+    """Returns the results of `rasterize_surfels` without backgrounds: gsplat 1.5.3 fails on them,
+    gives meta of invisible pairs too, and normals of one camera without its dimension."""
     gsplat = import_extra("gsplat", "cuda")
     *geometry, colors, viewmats, Ks = scene
     if options["sh_degree"] is None:
