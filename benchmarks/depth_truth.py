@@ -54,8 +54,7 @@ class DepthErrors(NamedTuple):
 
 
 def depth_errors(frames: Iterable[DepthFrame], reach: float, edges: bool = True) -> DepthErrors:
-    """Compares depth with the truth, both at most `reach` [m]; `edges` includes pixels within 2 px
-    of a discontinuity."""
+    """Compares depth with the truth, both at most `reach` [m]; `edges` includes discontinuities."""
     pairs = []
     for depth, truth in frames:
         used = ~np.isnan(truth)
@@ -73,8 +72,7 @@ def depth_errors(frames: Iterable[DepthFrame], reach: float, edges: bool = True)
 
 
 class TrueDepth:
-    """Renders exact depth of the solids of a generated world. Scenery beyond the volume has no
-    solids, nor have the crowns of forests above it."""
+    """Renders exact depth of a generated world's solids; scenery beyond the volume has none."""
 
     def __init__(self, spec: WorldSpec) -> None:
         self._lower_W, self._upper_W = spec.lower_W - _BEYOND, spec.upper_W + _BEYOND
@@ -84,8 +82,7 @@ class TrueDepth:
         self._scenery = BakedScene(merge(scenery)) if scenery else None
 
     def image(self, camera: OnboardCamera, X_WC: RigidTransform) -> NDArray[np.floating]:
-        """Returns planar depth (H, W) [m] at the centers of the pixels, exact to 3 mm; infinite
-        without a surface, NaN if unknown."""
+        """Returns planar depth (H, W) [m], exact to 3 mm; inf without a surface, NaN if unknown."""
         slopes_C = camera.ray_slopes()
         R_WC, p_WC = X_WC.rotation().matrix(), X_WC.translation()
         centers = PixelRays(slopes_C.reshape(-1, 3).astype(np.float32), half_pixel=0.0)
@@ -106,8 +103,7 @@ class TrueDepth:
 def frames_along_flight(
     scenario: Scenario, cameras: list[OnboardCamera], count: int
 ) -> list[list[DepthFrame]]:
-    """Flies a scenario in a generated world, and returns `count` frames of each camera, evenly in
-    time."""
+    """Flies a scenario, and returns `count` frames of each camera, evenly in time."""
     truth = TrueDepth(make_spec(scenario.world, scenario.seed))
     world = make_world(scenario.world, scenario.seed)
     flight = fly(BuildFlightDiagram(scenario, world, camera=False))

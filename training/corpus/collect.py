@@ -68,8 +68,7 @@ def render_samples(
     bound: float,
     rng: np.random.Generator,
 ) -> Samples:
-    """Renders demonstrations in an appearance that is drawn, each from its own pose and from
-    perturbed ones, displaced by at most `bound` [m]; `world` and `source` stay zero."""
+    """Renders demonstrations in a random appearance, displaced copies by at most `bound` [m]."""
     copies = config.perturbation.copies
     samples = Samples.zeros(len(demonstrations) * (1 + copies), config.size)
     if not demonstrations:
@@ -96,9 +95,8 @@ def render_samples(
     return samples
 
 
-# States off the expert's paths, anywhere in free space. An expert keeps clear of everything, so no
-# image of its flights shows a near obstacle straight ahead; and it does not stop near its goal.
-
+# Of states off the expert's paths, whose images show neither near obstacles straight ahead nor
+# stops near the goal.
 STATES_PER_APPEARANCE = 60
 
 _CLEARANCE = 0.05  # [m], minimum clearance
@@ -115,13 +113,10 @@ _SIDEWAYS = 0.3  # [m/s], standard deviation
 def draw_off_path(
     labeler: Labeler, count: int, speed: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Draws states (count, 13) from which a path leads to the goal.
-
-    Half are within a meter of a surface other than the ground and look at it. A quarter are within
-    4 m of the goal, uniform in distance, and look anywhere. The others are uniform in space and
-    look along the path. All deviate from that, and fly where they look, at up to `speed` [m/s] and
-    no faster than they can stop.
-    """
+    """Draws states (count, 13) from which a path leads to the goal: half within a meter of a
+    surface, looking at it; a quarter within 4 m of the goal, uniform in distance, looking anywhere;
+    the others uniform in space, looking along the path. All deviate from that, and fly where they
+    look, at up to `speed` [m/s] and no faster than they can stop."""
     field, toa = labeler.field, labeler.toa
     centers = toa.starts(field, _CLEARANCE)
     candidates = centers[rng.integers(len(centers), size=_CANDIDATES * count)]
@@ -215,9 +210,8 @@ def shard_folder(folder: Path, world: str, source: int = EXPERT) -> Path:
 
 @locks_folder("out")
 def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None) -> Corpus:
-    """Collects the first `worlds` worlds of a corpus in `out`, except those that it has already. An
-    interrupted run is resumed by the same call, with bitwise identical results. Damaged shards are
-    collected again. `jobs` worker processes, one for each core by default."""
+    """Collects the first `worlds` worlds of a corpus in `out`, those that are missing or damaged.
+    The same call resumes an interrupted run, with bitwise identical results."""
     validate(config)
     jobs = available_cores() if jobs is None else jobs
     require(jobs >= 1, "--jobs", "at least 1", jobs)

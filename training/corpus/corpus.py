@@ -218,8 +218,7 @@ class CorpusConfig(Config):
 
 
 class Corpus:
-    """The samples of a folder, indexed through its shards in order of their names. Images are
-    mapped into memory and read as they are used."""
+    """The samples of a folder, by the names of their shards. Images are mapped into memory."""
 
     def __init__(self, folder: Path) -> None:
         require_corpus(folder)
@@ -303,8 +302,7 @@ def distinct_worlds(corpora: Sequence[Corpus]) -> dict[str, WorldRecord]:
 
 
 def distinct_shards(corpora: Sequence[Corpus]) -> list[list[Shard]]:
-    """Lists the shards of each corpus that are not in those before it. Shards are equal if their
-    names and descriptions are, which have checksums of all files."""
+    """Lists the shards of each corpus whose name and description are not in those before it."""
     seen: dict[tuple[str, bytes], Shard] = {}
 
     def is_first(shard: Shard) -> bool:

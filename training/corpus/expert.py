@@ -70,8 +70,7 @@ class ExpertConfig(Config):
         return LatticeConfig(speed=self.speed, num_hypotheses=self.num_hypotheses)
 
 
-@dataclass(frozen=True, eq=False)
-class ExpertFlight:
+class ExpertFlight(NamedTuple):
     """A flight of the expert, and labels of states along it."""
 
     outcome: Outcome
@@ -86,8 +85,7 @@ class ExpertFlight:
 
 
 class Labeler:
-    """Plans the best trajectories from any state of a scene, whose unknown space is occupied,
-    to the goal p_WG (3,) [m]."""
+    """Plans trajectories from any state to the goal p_WG (3,) [m]; unknown space is occupied."""
 
     def __init__(self, esdf: Esdf, p_WG: np.ndarray, config: ExpertConfig) -> None:
         self._lattice = TrajectoryLattice(config.lattice())
@@ -95,18 +93,15 @@ class Labeler:
         self.toa = time_of_arrival(self.field, p_WG, config.lattice().margin)
 
     def label(self, time: float, state: np.ndarray) -> Hypotheses:
-        """Plans the K best distinct trajectories from a state (13,), cheapest first; raises
-        InfeasibleFlightError if no path leads to the goal."""
+        """Plans the K best trajectories from a state (13,), cheapest first; may raise as `plan`."""
         return plan(time, state, self.field, self.toa, self._lattice)
 
     def labels(self, states: Iterable[np.ndarray]) -> list[Label]:
         """Labels the states (13,) from which a path leads to the goal."""
         labels = []
         for state in states:
-            try:
+            with contextlib.suppress(InfeasibleFlightError):
                 labels.append(Label(state, self.label(0.0, state)))
-            except InfeasibleFlightError:
-                continue
         return labels
 
 
@@ -116,7 +111,6 @@ def fly_policy(
     """Flies the expert's policy from p_WS (3,) [m] to the world's goal, as in the benchmark."""
     policy = policy_named(config.policy, config.speed)
     scenario = Scenario(start=p_WS.tolist(), start_radius=0.0, policy=policy)
-    scenario.validate()
     flight = fly(BuildFlightDiagram(scenario, world, camera=False))
     times = np.arange(0.0, flight.times[-1], config.period)
     return ExpertFlight(
@@ -130,9 +124,8 @@ def fly_policy(
 def fly_planner(
     p_WS: np.ndarray, world: World, config: ExpertConfig, labeler: Labeler
 ) -> list[ExpertFlight]:
-    """Flies the planner from each of the starts p_WS (N, 3) [m] to the labeler's goal, all at once.
-    The vehicles have the equations of the simulated plant and its controller. They look along their
-    path and follow their labels."""
+    """Flies the planner from the starts p_WS (N, 3) [m] to the labeler's goal, all at once, by the
+    equations of plant and controller, looking along the path."""
     control, params, p_WG = FlatnessControllerConfig(), QuadrotorParams(), labeler.toa.p_WG
     substeps = ceil(config.period / _STEP - 1e-9)
     dt = config.period / substeps

@@ -56,8 +56,7 @@ _TOLERANCE = 0.25  # [m/s], of the mean velocity between samples; without gaps i
 
 
 def export(corpus: Corpus, out: Path, *, replace: bool = False) -> str:
-    """Writes the dataset to the folder `out` atomically; returns a line on what it has and what is
-    left out."""
+    """Writes the dataset to the folder `out` atomically; returns a summary line."""
     expert = [shard for shard in corpus.shards if shard.source == EXPERT and len(shard)]
     states = alone = 0
     with folder_written_atomically(out, replace=replace) as folder:
@@ -78,11 +77,8 @@ def export(corpus: Corpus, out: Path, *, replace: bool = False) -> str:
 
 
 def _runs(shard: Shard, corpus: Corpus) -> Iterator[np.ndarray]:
-    """Yields the rows of consecutive states at constant spacing in each flight of a shard.
-
-    A flight of as many states as its duration has periods is complete. In others the mean velocity
-    between two states tells whether states between them are missing.
-    """
+    """Yields the rows of consecutive states in each flight. A flight is complete if it has as many
+    states as periods; in others, mean velocities between states tell where some are missing."""
     period, copies = corpus.config.expert.period, 1 + corpus.config.perturbation.copies
     states = sum(flight["states"] for flight in shard.flights)
     what = f"the states of all flights in {shard.path}"
@@ -270,8 +266,7 @@ def _histogram(images: np.ndarray, codes: int) -> np.ndarray:
 
 
 def _image_stats(histogram: np.ndarray, values: np.ndarray, count: int) -> dict[str, list]:
-    """Computes LeRobot's statistics of `count` images by channel, from the histogram (C, n) of
-    their values (n,)."""
+    """Computes statistics of `count` images by the histograms (C, n) of their values (n,)."""
     below = np.cumsum(histogram, axis=1) / histogram.sum(axis=1, keepdims=True)
     mean = histogram @ values / histogram.sum(axis=1)
     square = histogram @ values**2 / histogram.sum(axis=1)

@@ -111,18 +111,14 @@ def scenario_world(kind: str) -> WorldConfig:
 def check_library(kinds: Sequence[str], scenes: Sequence[str]) -> None:
     """Checks that there are kinds or scenes, and that the worlds of the kinds are generated."""
     require(kinds or scenes, "worlds.kinds", "one kind or more without worlds.scenes", kinds)
+    remedy = f"choose from {', '.join(PROCEDURAL)} and files, and put captured scenes into "
     for kind in kinds:
-        remedy = (
-            f"choose from {', '.join(PROCEDURAL)} and files, and put captured scenes into "
-            "worlds.scenes"
-        )
         generated = is_procedural(scenario_world(kind))
-        require(generated, "worlds.kinds", "of generated worlds", kind, remedy)
+        require(generated, "worlds.kinds", "of generated worlds", kind, f"{remedy}worlds.scenes")
 
 
 def training_scene(scene: str, split: str = "train") -> Path:
-    """Finds a scene folder or an OctoMap, and checks that it may be learned from; an OctoMap states
-    no split and counts as "train"."""
+    """Finds a scene folder of `split`, or an OctoMap, and checks that it may be learned from."""
     found = find_scene(SceneConfig(path=scene))
     if found.suffix.lower() == OCTOMAP:
         require_untested(part_digests([found.read_bytes()]), str(found))
@@ -227,9 +223,7 @@ class PerturbationConfig(Config):
 def perturb_pose(
     X_WB: RigidTransform, config: PerturbationConfig, reach: float, rng: np.random.Generator
 ) -> RigidTransform:
-    """Draws a pose near X_WB, displaced by at most `config.distance` and at most `reach` [m]. The
-    displacement is uniform in that sphere. If `reach` is at most the clearance at X_WB, the pose is
-    free too."""
+    """Draws a pose near X_WB, displaced within `config.distance` and `reach` [m], uniformly."""
     direction = rng.normal(size=3)
     radius = max(0.0, min(config.distance, reach)) * rng.uniform() ** (1 / 3)
     p_BP_W = radius * direction / np.linalg.norm(direction)

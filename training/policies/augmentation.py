@@ -43,8 +43,7 @@ def depth_noise() -> ObservationNoise:
 def check_noise(
     noise: ObservationNoise, *, depth: bool = False, color: bool = False, time: bool
 ) -> None:
-    """Raises FieldError for noise of a kind that the trainer's images do not have: of depth, of
-    color, or of time, as late and lost images."""
+    """Raises FieldError for noise of depth, color or time (late, lost) that images do not have."""
     for has, names in ((depth, _DEPTH), (color, _COLOR), (time, _TIME)):
         for name in () if has else names:
             require_field(noise, name, not getattr(noise, name), "left out")
@@ -77,8 +76,7 @@ def noisy_color(color: Tensor, noise: ObservationNoise, generator: torch.Generat
 
 
 def blur(color: Tensor, sigma: float) -> Tensor:
-    """Blurs colors (N, H, W, 3) by a Gaussian of a standard deviation [px], as `cv2.GaussianBlur`
-    does floats: it ends after 4 sigma, and images are reflected at their borders."""
+    """Blurs colors (N, H, W, 3) by a Gaussian [px], as `cv2.GaussianBlur` blurs floats."""
     size = [round(8 * sigma + 1) | 1] * 2
     return gaussian_blur(color.movedim(-1, 1), size, [sigma, sigma]).movedim(1, -1)
 

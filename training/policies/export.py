@@ -50,11 +50,9 @@ class _Distilled(nn.Module):
 
 
 def export(weights: Path, out: Path) -> None:
-    """Writes the network of a file of weights to an ONNX file, for one image at a time.
-
-    Inputs are `image`, `state` and, with memory, `hidden`; outputs are `output` and the next
-    hidden state, or `waypoints` and `costs`. Raises ValueError for a policy without an export.
-    """
+    """Writes the network of a file of weights to an ONNX file, for one image at a time. Inputs are
+    `image`, `state` and, with memory, `hidden`; outputs `output` and `next_hidden`, or `waypoints`
+    and `costs`."""
     policy = checkpoint_policy(weights)
     if policy in _RECURRENT:
         spec = _RECURRENT[policy]

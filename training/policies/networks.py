@@ -35,8 +35,7 @@ class TrainableNetwork(nn.Module):
             self.head.bias.zero_()
 
     def forward(self, image: Tensor, state: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Computes outputs (N, O) and hidden states (N, H) from images (N, height, width), or of
-        several channels, states (N, S) and hidden states."""
+        """Computes outputs (N, O) and hidden states (N, H) of images (N, H, W) or (N, C, H, W)."""
         x = self.convolutions(image if image.dim() == 4 else image[:, None])
         features = _leaky(self.state_layer(state))
         hidden = self.memory(torch.cat([x.flatten(1), features], 1), hidden)
@@ -59,8 +58,7 @@ class TrajectoryModule(nn.Module):
         self.output = nn.Linear(spec.head_features, 3 * NUM_WAYPOINTS + 1)
 
     def forward(self, image: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Computes waypoints (N, 3, 10, 3) [m] and costs (N, 3) from images (N, H, W) and states
-        (N, 18)."""
+        """Computes waypoints (N, 3, 10, 3) [m] and costs (N, 3) from images and states (N, 18)."""
         x = _leaky(self.image_layer(self.convolutions(image[:, None]).flatten(1)))
         y = _leaky(self.state_layer_2(_leaky(self.state_layer(state))))
         modes = _leaky(self.modes(torch.cat([x, y], 1))).reshape(len(image), MODES, -1)
@@ -120,8 +118,7 @@ class StudentModule(nn.Module):
         self.register_buffer("_basis", torch.from_numpy(BASIS).float(), persistent=False)
 
     def _initialize_encoder(self) -> None:
-        """Initializes the encoder such that the variance of activations is kept without batch
-        norms, and that modules with a skip add zero."""
+        """Keeps the variance of activations without batch norms; modules with a skip add zero."""
         weights = self.state_dict()
         for block in student.mobilenet_blocks():
             rectified = False
@@ -137,8 +134,7 @@ class StudentModule(nn.Module):
         return nn.ModuleList([*self.features, self.cell_layer][:count])
 
     def encode_image(self, image: Tensor, first: int, last: int = IMAGE_MODULES) -> Tensor:
-        """Passes images (N, 3, height, width), or the output of the modules before `first`, through
-        the `IMAGE_MODULES` from `first` to before `last`."""
+        """Passes images, or the output of modules before `first`, through those before `last`."""
         if first < last:
             image = self.features[first:last](image)
         if first < last == IMAGE_MODULES:
@@ -178,12 +174,9 @@ _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # [-] of torchvision
 
 
 def imagenet_weights() -> dict[str, Tensor]:
-    """Reads the encoder's weights by the names of `mobilenet_shapes`, for images of -1 to 1.
-
-    The file is a state dictionary of torchvision's `mobilenet_v2`: `IN_DATA`, or else torchvision's
-    download. Batch norms and torchvision's input scaling, (x - mean) / std, are folded into the
-    convolutions. A file with trivial batch norms is for images of -1 to 1.
-    """
+    """Reads the encoder's weights by the names of `mobilenet_shapes`, for images of -1 to 1, from a
+    state dictionary of torchvision's `mobilenet_v2`: `IN_DATA` or a download. Batch norms and
+    scaling of the input are folded in; a file with trivial batch norms is for images of -1 to 1."""
     data = os.environ.get("SPLATPILOT_DATA")
     paths = [Path(data) / IN_DATA] if data else []
     paths.append(Path(torch.hub.get_dir()) / _DOWNLOADED)

@@ -41,9 +41,8 @@ class Geometry:
     _native: Any  # `_native.ShapeWorlds` or `_native.GridWorlds`
 
     def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
-        """Renders planar depth (N, R) [m] from p_WC (N, 3) [m]; infinite without a surface. A pixel
-        has the minimum depth of all its parts: rays hit surfaces within half a pixel, at the depth
-        of the widened surface plus half a pixel's width there."""
+        """Renders planar depth (N, R) [m] from p_WC (N, 3) [m]; inf without a surface. Rays hit
+        surfaces within half a pixel, at the depth of the widened surface plus half its width."""
         depth = torch.empty(len(p_WC), len(rays.directions_C))
         poses = {"p_WC": _array(p_WC), "R_WC": _array(R_WC), "world": _array(world)}
         self._native.depth(**poses, **rays._asdict(), depth=depth.numpy())
@@ -51,14 +50,12 @@ class Geometry:
 
     def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Computes signed distances (N, K) [m] at p_WQ (N, 3) [m] to the K <= `count` nearest
-        obstacles, nearest first, and their gradients (N, K, 3); infinite and 0 if there are fewer.
-        """
+        obstacles, nearest first, and their gradients (N, K, 3); inf and 0 if there are fewer."""
         raise NotImplementedError
 
 
 class ShapeGeometry(Geometry):
-    """Worlds of analytic shapes. Results are equal for any number of threads and any instructions
-    `simd` of `_native.simd_levels()`; the widest by default."""
+    """Worlds of analytic shapes; results are equal for all `threads` and instructions `simd`."""
 
     def __init__(self, worlds: Sequence[Sequence[Shape]], threads: int = 1, simd: str = "") -> None:
         rows, kinds = shape_rows([shape for world in worlds for shape in world])
@@ -75,8 +72,7 @@ class ShapeGeometry(Geometry):
 
 
 class Grids:
-    """Values over the voxels of several worlds, interpolated trilinearly: (nx, ny, nz) of each, at
-    the centers of voxels, at least two along each axis."""
+    """Grids (nx, ny, nz) of values at the centers of voxels, interpolated trilinearly."""
 
     def __init__(
         self,
@@ -96,8 +92,7 @@ class Grids:
         )
 
     def interpolate(self, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
-        """Interpolates values (N,) and gradients (N, 3) [1/m] at p_WQ (N, 3) [m]; constant beyond
-        the outermost centers."""
+        """Interpolates values (N,) and gradients (N, 3) at p_WQ (N, 3) [m]; constant outside."""
         return _query(self._native.interpolate, p_WQ, world)
 
 

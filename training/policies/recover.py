@@ -1,8 +1,7 @@
 """Trains in two stages: by an expert's flights, then also by its labels of a student's near-misses.
 
-After the paper, Sec. III-B. The student of the first stage flies the expert's paths in its training
-worlds; the second stage trains on all samples. Another policy may fly instead of a first stage.
-`diffaero_rgb` learns from the same corpora.
+After the paper, Sec. III-B: the student of the first stage, or another policy, flies the expert's
+paths in its training worlds; the second stage trains on all samples.
 """
 
 import json
@@ -92,9 +91,8 @@ class StudentFlight:
 
 
 def obstacle_clearances(flight: StudentFlight, field: DistanceField) -> np.ndarray:
-    """Returns the clearances (N,) [m] of a flight; infinite if ground or ceiling are nearest. Their
-    normal is vertical, and no horizontal step leads away from them; one does from a wire, the top
-    of a wall or a table."""
+    """Returns the clearances (N,) [m] of a flight; infinite if ground or ceiling are nearest: with
+    a vertical normal, from which no horizontal step leads away."""
     p_WB = flight.states[:, :3]
     nearest = field.query(p_WB)
     level = np.abs(nearest.gradient[:, 2]) > _LEVEL
@@ -104,8 +102,7 @@ def obstacle_clearances(flight: StudentFlight, field: DistanceField) -> np.ndarr
 
 
 def near_misses(times: np.ndarray, clearances: np.ndarray) -> np.ndarray:
-    """Finds the times (m,) [s] of minima below `NEAR` of evenly sampled clearances (N,) [m]. They
-    are at least `SEPARATION` apart; the first and the last sample may be minima."""
+    """Finds times (m,) [s] of minima of clearances (N,) [m] below `NEAR`, `SEPARATION` apart."""
     closeness = np.concatenate([[-np.inf], -np.nan_to_num(clearances, nan=np.inf), [-np.inf]])
     samples = max(1.0, SEPARATION / np.median(np.diff(times))) if len(times) > 1 else 1.0
     peaks, _ = find_peaks(closeness, height=np.nextafter(-NEAR, 0.0), distance=samples)
@@ -200,8 +197,7 @@ def list_tasks(shards: Sequence[Shard], flights: int) -> dict[str, list[dict[str
 def fly_worlds(
     corpus: Corpus, tasks: dict[str, list[dict[str, Any]]], policy: str, folder: Path, jobs: int
 ) -> tuple[list[StudentFlight], Counter[str]]:
-    """Flies a policy, or a file of weights, in worlds of a corpus; returns flights and counts of
-    their outcomes."""
+    """Flies a policy, or a file of weights, in worlds of a corpus; also counts outcomes."""
     folder.mkdir(parents=True, exist_ok=True)
     work = [
         (record, tasks[record.name], folder / f"{record.name}.npz")
@@ -294,11 +290,9 @@ def run[Config: CorpusTraining](
     same call resumes an interrupted run; the corpora of `config` are not changed.
 
     Writes to `out`: `stage_1` and `stage_2`, see `train.run`; `corpora`, links to those of
-    `config`, with the recovery samples; `flights`, a file per world, of up to `flights` flights
-    each; `recovery.yaml`, see `RecoveryFlights`; `recovery.json`, counts of flights and samples,
-    which is returned. `flown_by`, a policy or file of weights, flies instead of a first stage,
-    through its own camera; students see through the corpora's.
-    """
+    `config`, with the recovery samples; `flights`, files of up to `flights` flights in a world;
+    `recovery.yaml`, see `RecoveryFlights`; `recovery.json`, counts, which is returned. `flown_by`,
+    a policy or file of weights, flies instead of a first stage, through its own camera."""
     for name, value in (("flights", flights), ("jobs", jobs)):
         require(value >= 1, f"--{name}", "at least 1", value)
     # Missing inputs are refused before anything is written.

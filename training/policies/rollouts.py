@@ -48,8 +48,7 @@ class Agent(Protocol):
         ...
 
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, Tensor | None, Tensor]:
-        """Computes accelerations (N, 3) [m/s^2] in W, headings (N,) [rad] or None, and the next
-        hidden states."""
+        """Computes a_WB (N, 3) [m/s^2], headings (N,) [rad] or None, and the next hidden states."""
         ...
 
 
@@ -70,9 +69,8 @@ class Outcomes(NamedTuple):
     nominal_speed: Tensor  # (N,) [m/s]
 
     def metrics(self, kinds: Sequence[str] = ()) -> dict[str, float]:
-        """Computes fractions of flights that reached the goal, collided and left, means of minimum
-        clearance [m] and speed [m/s], and the success at each nominal speed and in each of the
-        `kinds` of worlds, which take turns."""
+        """Computes fractions of flights that reached the goal, collided and left; means; and the
+        success at each nominal speed and in each of the `kinds` of worlds, which take turns."""
         flown: dict[str, list[bool]] = {}
         flights = zip(self.reached.tolist(), self.nominal_speed.tolist(), strict=True)
         for n, (reached, speed) in enumerate(flights):
@@ -115,8 +113,7 @@ def evaluate_agent(
     noise: ObservationNoise,
     seed: int = 0,
 ) -> Outcomes:
-    """Flies through every world once, from rest at its start, level and facing the goal, with noisy
-    and late images."""
+    """Flies through every world once, from rest, facing the goal, with noisy and late images."""
     device = worlds.p_WS.device
     generator = torch.Generator(device).manual_seed(seed)
     count = len(worlds)
@@ -178,8 +175,7 @@ class FlightTraining(TrainingConfig):
 
 
 class FlightTrainer(Trainer):
-    """Base class of trainers that fly in training worlds, evaluated by flights in held-out ones.
-    The agent has a `network`; `noise` is of images."""
+    """Base class of trainers that fly, evaluated in held-out worlds; `noise` is of images."""
 
     def __init__(self, config: FlightTraining, agent: Any, noise: ObservationNoise) -> None:
         self.network, self.spec = agent.network, agent.network.spec
@@ -224,8 +220,7 @@ class Learner(Agent, Protocol):
     network: Any  # torch.nn.Module with the `spec` of its architecture
 
     def losses(self, transitions: Transitions) -> dict[str, Tensor]:
-        """Computes the weighted terms of the loss, each a mean over the transitions since the last
-        call."""
+        """Computes the weighted terms of the loss, each a mean since the last call."""
         ...
 
 

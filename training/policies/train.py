@@ -266,8 +266,7 @@ TRAINERS = Registry("trainer", "splatpilot.trainers", TrainerEntry)
 
 
 def register_trainer(name: str, config: type, make: Callable[[Any], Trainer]) -> None:
-    """Registers the trainer of a policy for `splatpilot train`: the type of its configurations, see
-    `splatpilot.training.policies.trainer`, and what makes the `Trainer` of one."""
+    """Registers a trainer for `splatpilot train`: its configuration and what makes a `Trainer`."""
     TRAINERS.add(name, TrainerEntry(config, make))
 
 

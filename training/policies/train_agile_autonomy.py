@@ -1,11 +1,10 @@
 """Trains Agile Autonomy: imitation of an expert that samples trajectories and knows the world.
 
-After "Learning High-Speed Flight in the Wild" (A. Loquercio et al., Science Robotics 2021). Chosen
-here: the expert is the lattice of `systems.policies.lattice` instead of a Metropolis-Hastings
-sampler; a convolutional encoder of 32x24 pixels, trained with the rest, instead of a frozen
-MobileNet at 224; dense layers instead of convolutions of length one; trajectories of the expert
-that are much worse than its best are not imitated; contact costs 2 at the vehicle's own radius
-instead of 0.3 m; a meter toward the goal reduces the cost by 0.1 when a hypothesis is chosen.
+After "Learning High-Speed Flight in the Wild" (A. Loquercio et al., Science Robotics 2021). Different
+here: the expert is `systems.policies.lattice` instead of a Metropolis-Hastings sampler; a trained
+encoder of 32x24 pixels instead of a frozen MobileNet; dense layers; the expert's much worse
+trajectories are not imitated; contact costs 2 at the vehicle's own radius instead of 0.3 m; a meter
+toward the goal reduces the cost by 0.1 when a hypothesis is chosen.
 """
 
 from collections.abc import Iterable
@@ -180,9 +179,8 @@ class AgileAutonomyTrainer(FlightTrainer):
 
     @torch.no_grad()
     def _collision_costs(self, waypoints_B: Tensor, sample: dict[str, Tensor]) -> Tensor:
-        """Computes mean collision costs (N, M) of trajectories (N, M, 10, 3) [m] in B: 4 - 2 d² /
-        0.09 below d = 0.3 m and from there linearly from 2 to 0 at d = 0.8 m,
-        with d = clearance + 0.3 m."""
+        """Computes mean collision costs (N, M) of trajectories (N, M, 10, 3) [m] in B, with
+        d = clearance + 0.3 m: 4 - 2 d² / 0.09 below 0.3 m, from there linearly to 0 at 0.8 m."""
         N, M = waypoints_B.shape[:2]
         points = waypoints_B.flatten(1, 2) @ sample["R_WB"].mT + sample["p_WB"][:, None]
         world = sample["world"].repeat_interleave(points.shape[1])
@@ -193,8 +191,7 @@ class AgileAutonomyTrainer(FlightTrainer):
 
     @torch.no_grad()
     def _collect(self, student: float, first_world: int, steps: Iterable[int]) -> dict[str, Tensor]:
-        """Collects observations and labels over steps, while the student flies a fraction of the
-        vehicles and the expert the others, in the worlds from `first_world`."""
+        """Collects labels in worlds from `first_world`; the student flies a fraction of them."""
         config, worlds = self._config, self.worlds
         N, device = config.environments, config.device
         world = (first_world + torch.arange(N, device=device)) % len(worlds)
@@ -260,8 +257,7 @@ class AgileAutonomyTrainer(FlightTrainer):
     def _ask(
         self, vehicle: vehicles.BodyRate, world: Tensor, which: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Computes the expert's three best trajectories: whether there are any (N,), waypoints
-        (N, 3, 10, 3) [m] in the body frame, and costs (N, 3)."""
+        """Computes the expert's best: valid (N,), points (N, 3, 10, 3) [m] in B, costs (N, 3)."""
         N, device = len(world), world.device
         valid = torch.zeros(N, dtype=torch.bool)
         experts, costs = torch.zeros(N, 3, NUM_WAYPOINTS, 3), torch.zeros(N, 3)

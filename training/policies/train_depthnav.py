@@ -1,12 +1,10 @@
 """Trains DepthNav: through the dynamics, down the time of arrival, heading along the path.
 
 After "Quadrotor Navigation using Reinforcement Learning with Privileged Information" (2025,
-arXiv:2509.08177), with its weights of the loss. Chosen here, because the publication is silent or a
-CPU too slow: 25 Hz instead of 50, 32 vehicles, 40 steps per update instead of 150; the mean
-velocity of 0.5 s instead of 2 s and a gradient decay of 0.4 per second, without which vehicles
-learn to hover; velocity and attitude quaternion as the state, target velocity and speed as the
-target; yaw as an angle from the direction of the goal, with the loss 1 - cos of its angle to the
-path; rates from jerk over gravity.
+arXiv:2509.08177), with its weights of the loss. Different here: 25 Hz, 32 vehicles and 40 steps per
+update for a CPU; the mean velocity of 0.5 s and a gradient decay, without which vehicles learn to
+hover; velocity and attitude quaternion as the state; target velocity and speed; yaw from the
+direction of the goal, with the loss 1 - cos of its angle to the path; rates from jerk over gravity.
 """
 
 from dataclasses import dataclass, field
@@ -105,8 +103,7 @@ class DepthNavLearner:
 
 
 def quaternion_from_rotation(R: Tensor) -> Tensor:
-    """Computes the quaternions (N, 4) wxyz, w >= 0, of rotations (N, 3, 3), differentiable, each
-    from its largest component."""
+    """Computes quaternions (N, 4) wxyz, w >= 0, of rotations (N, 3, 3), differentiable."""
     m00, m11, m22 = R.diagonal(dim1=1, dim2=2).unbind(1)
     yz, zx, xy = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
     sxy, szx, syz = R[:, 1, 0] + R[:, 0, 1], R[:, 0, 2] + R[:, 2, 0], R[:, 2, 1] + R[:, 1, 2]

@@ -1,14 +1,12 @@
 """Trains DiffAero: analytic gradients of a loss through the dynamics of flight.
 
 After "DiffAero: A GPU-Accelerated Differentiable Simulation Framework for Efficient Quadrotor
-Policy Learning" (2025). Different here: the convolutional and recurrent variant instead of the
-perceptron; depth to 12 m as 3 / z - 0.6 instead of 1 - range / 5 m; the nearest surface in each
-pixel instead of one ray; 15 Hz instead of 30; accelerations without gravity; 64 environments
-instead of 1024; in the loss, desired velocities along the path around obstacles (time of arrival)
-instead of straight to the goal; clearance terms after "Back to Newton's Laws: Learning
-Vision-based Agile Flight via Differentiable Physics" (2024), weighted by the speed of approach,
-through which the gradient flows, instead of that speed as a constant of at least 1 m/s; a vehicle
-that collides flies on until the update ends; the benchmark's kinds of worlds.
+Policy Learning" (2025). Different here: the convolutional and recurrent variant; depth to 12 m as
+3 / z - 0.6 instead of 1 - range / 5 m; the nearest surface in each pixel; 15 Hz; accelerations
+without gravity; 64 environments; desired velocities down the time of arrival instead of straight to
+the goal; clearance terms after "Back to Newton's Laws: Learning Vision-based Agile Flight via
+Differentiable Physics" (2024) with a gradient through the speed of approach; a vehicle that
+collides flies on until the update ends.
 """
 
 from dataclasses import dataclass, field, replace
@@ -102,8 +100,7 @@ class DiffAeroLearner:
 
 @dataclass
 class DiffAeroTofTraining(DiffAeroTraining):
-    """A training run of DiffAero by the grid of a time-of-flight sensor, with 10 to 30 images per
-    second, some late and some lost."""
+    """A training run by the grid of a time-of-flight sensor, with late and lost images."""
 
     schedule: Schedule = field(default_factory=lambda: Schedule(updates=6000, validate_every=500))
     rollout: RolloutConfig = field(
@@ -134,8 +131,7 @@ class DiffAeroTofLearner(DiffAeroLearner):
         self._limits = torch.tensor(diffaero.VELOCITY_LIMITS, dtype=torch.float32, device=device)
 
     def encode(self, depth: Tensor) -> Tensor:
-        """Encodes depth (N, R) [m] as proximities (N, 9, 16), the lowest row first, see
-        `splatpilot.systems.sensing.time_of_flight`."""
+        """Encodes depth (N, R) [m] as `TimeOfFlightGrid` does: proximities (N, 9, 16)."""
         sensor, (H, W) = self._sensor, self._range_of_depth.shape
         depth = torch.where(depth > UNMEASURED_DEPTH, depth, sensor.max_range).reshape(-1, H, W)
         blocks = (-1, sensor.rows, H // sensor.rows, sensor.columns, W // sensor.columns)

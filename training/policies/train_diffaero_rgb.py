@@ -1,15 +1,13 @@
 """Trains both policies of RGB: DiffAero's depth from images of a corpus, and all of it in flight.
 
-`diffaero_rgb`: DiffAero, trained by depth, decides and stays as it is. A network learns to predict
-its grid of inverse depths from one image, with the expected error of each cell, by Laplace's
-likelihood. Half of the images are flipped horizontally; all are relit and noisy.
+`diffaero_rgb`: DiffAero, trained by depth, decides. A network learns to predict its grid of inverse
+depths from one image, with the error of each cell, by Laplace's likelihood.
 
-`distilled_rgb`: point masses fly through generated and captured worlds by the student's decisions
-from rendered images. The teacher, DiffAero, decides from the depth of the same camera, with a
-memory of its own along the student's flight: DAgger (Ross, Gordon and Bagnell, 2011) without a
-phase in which the teacher flies. The loss has the difference of both decisions, the likelihood of
-the teacher's depth grid, and DiffAero's loss through the dynamics, in which images are constant.
-Every second vehicle flies in the mirror image of its world; the appearance of worlds changes.
+`distilled_rgb`: point masses fly by the student's decisions from rendered images; the teacher,
+DiffAero, decides from depth, with a memory of its own: DAgger (Ross, Gordon and Bagnell, 2011) in
+which only the student flies. The loss has the difference of both decisions, the likelihood of the
+teacher's depth grid, and DiffAero's loss through the dynamics, in which images are constant. Every
+second vehicle flies in the mirror image of its world.
 """
 
 from dataclasses import dataclass, field, replace
@@ -94,8 +92,7 @@ class MonocularModule(nn.Module):
         self.coarse = blocks("coarse", len(spec.coarse_dilations))
 
     def forward(self, view: Tensor) -> Tensor:
-        """Predicts inverse depths and logarithms of their errors (N, 2, 9, 16) from views
-        (N, 6, 90, 160)."""
+        """Predicts inverse depths and logarithms of errors (N, 2, 9, 16) from views."""
         x = self.fine(nn.functional.leaky_relu(self.stem(view), LEAK))
         return self.head(self.coarse(nn.functional.leaky_relu(self.halving(x), LEAK)))
 
@@ -125,8 +122,7 @@ class DiffAeroRgbModule(nn.Module):
         self.register_buffer("_rays_B", torch.from_numpy(rays_B()).flatten(0, 1), persistent=False)
 
     def encode(self, color: Tensor, R_HB: Tensor) -> Tensor:
-        """Encodes colors (N, 90, 160, 3), 0 to 255, and the pixels' rays in the heading frame at
-        the attitudes R_HB (N, 3, 3) as views (N, 6, 90, 160)."""
+        """Encodes colors (N, 90, 160, 3) and rays at R_HB (N, 3, 3) as `encode_view` does."""
         rays_H = (R_HB @ self._rays_B.mT).unflatten(2, (HEIGHT, WIDTH))
         return torch.cat([encode_color(color), rays_H], 1)
 
@@ -239,8 +235,7 @@ beyond 5; `error` the mean absolute error of all cells' inverse depths, 3 m / z.
         }
 
     def _samples(self, indices: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
-        """Reads colors (N, 90, 160, 3), 0 to 255, attitudes R_HB (N, 3, 3) and maximum inverse
-        depths of cells (N, 9, 16)."""
+        """Reads colors (N, 90, 160, 3), R_HB (N, 3, 3) and maximum inverse depths (N, 9, 16)."""
         color = torch.from_numpy(self._data.pixels(indices, "color")[:, self._rows()])
         R_WB = rotation_matrices(self._data.labels(indices).X_WB[:, :4])
         R_WH = heading_frame(torch.atan2(R_WB[:, 1, 0], R_WB[:, 0, 0]))
@@ -332,11 +327,9 @@ class DistilledRgbModule(DiffAeroRgbModule):
 
 
 class DistilledRgbLearner(DiffAeroLearner):
-    """Flies by RGB, and collects the teacher's decisions while it learns.
-
-    A row of the memory has the hidden state; the same with gradients of the images alone, not of
-    the flight; the teacher's; and -1 if the world is flipped, else 1, or 0 before the first image.
-    """
+    """Flies by RGB, and collects the teacher's decisions while it learns. A row of the memory has
+    the hidden state; the same with gradients of the images alone; the teacher's; and -1 if the
+    world is flipped, else 1, or 0 before the first image."""
 
     def __init__(self, config: DistilledRgbTraining) -> None:
         super().__init__(config.loss.flight, config.device)

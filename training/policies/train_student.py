@@ -78,8 +78,7 @@ class Labels(NamedTuple):
 
 
 class StudentData:
-    """The distinct samples of several corpora. A fraction of their worlds is held out, see
-    `held_out_worlds`. Labels are on a device; images stay on disk."""
+    """The distinct samples of corpora, of which worlds are held out; images stay on disk."""
 
     def __init__(self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu") -> None:
         first = corpora[0].config
@@ -137,8 +136,7 @@ class StudentData:
         return digest.hexdigest()
 
     def draw(self, count: int, generator: torch.Generator, recovery_share: float = 0) -> np.ndarray:
-        """Draws indices (count,) of training samples, those of recovery with the probability
-        `recovery_share`; if it is 0, all samples are as likely."""
+        """Draws training samples (count,), `recovery_share` of them of recovery; any if it is 0."""
 
         def integers(limit: int) -> np.ndarray:
             drawn = torch.randint(limit, (count,), generator=generator, device=generator.device)
@@ -164,8 +162,7 @@ class StudentData:
         return zip(shard, indices - self.first[shard], strict=True)
 
     def distance_along(self, waypoints_B: Tensor, labels: Labels) -> Tensor:
-        """Computes signed distances (N, M, T) [m] at waypoints (N, M, T, 3) [m], differentiable by
-        the waypoints."""
+        """Computes distances (N, M, T) [m] at waypoints (N, M, T, 3) [m], differentiable."""
         N, M, T, _ = waypoints_B.shape
         R_WB, p_WB = rotation_matrices(labels.X_WB[:, :4]), labels.X_WB[:, None, 4:]
         p_WQ = (waypoints_B.flatten(1, 2) @ R_WB.mT + p_WB).flatten(0, 1)
@@ -182,9 +179,8 @@ class StudentData:
 
 
 def held_out_worlds(records: Mapping[str, WorldRecord], fraction: float) -> list[str]:
-    """Returns the names, in order, of the `fraction` of all worlds that validate, by `rank`. Only
-    the name of a world counts, or the source of its scene if there are others, so that it stays on
-    its side when corpora grow."""
+    """Returns the worlds, in order, of the `fraction` that validate: by the `rank` of their name,
+    or of the source of their scene if there are others, so that corpora may grow."""
     environments = _environments(records)
     return [name for name in sorted(records) if rank(environments[name]) < fraction]
 
@@ -207,9 +203,8 @@ def encode_images(images: Tensor) -> Tensor:
 
 
 class FrozenFeatures:
-    """Outputs of the network's first modules for all samples, computed once and kept in files. The
-    file of a shard is named by a digest of its images and the modules' weights, so that runs share
-    files and corpora may grow. `frozen` is the number of modules, of `IMAGE_MODULES`."""
+    """Outputs of the network's first `frozen` modules for all samples, computed once. The file of a
+    shard is named by a digest of images and weights, so that runs share files."""
 
     def __init__(
         self, folder: Path, data: StudentData, network: StudentModule, frozen: int
@@ -345,9 +340,8 @@ def imitation_terms(errors: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
 
 
 def penalties(errors: Tensor, distances: Tensor) -> Tensor:
-    """Computes u_m (N, M) = L_m + GEOMETRIC_WEIGHT g_m of equation 4, with the errors L_m to the
-    expert's best trajectory alone; g is the soft barrier of equation 3, integrated over the
-    trajectory by signed distances (N, M, T) [m]."""
+    """Computes u_m (N, M) = L_m + GEOMETRIC_WEIGHT g_m of equation 4; g integrates the soft barrier
+    of equation 3 over the trajectory by signed distances (N, M, T) [m]."""
     barrier = WAYPOINT_PERIOD * soft_barrier(distances, VEHICLE_RADIUS).sum(2)
     return errors + GEOMETRIC_WEIGHT * barrier
 

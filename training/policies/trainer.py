@@ -33,8 +33,7 @@ class Schedule(Config):
     tensorboard: bool = False
 
     def due(self, update: int) -> tuple[bool, bool]:
-        """Tells whether to write a checkpoint and whether to evaluate after an update. The first
-        checkpoint is evaluated too, so that weights exist early."""
+        """Tells whether to write a checkpoint and to evaluate, as after the first checkpoint."""
         last = update == self.updates
         evaluate = update % self.validate_every == 0 or update == self.checkpoint_every
         return last or update % self.checkpoint_every == 0, last or evaluate
@@ -108,8 +107,7 @@ class Trainer:
         raise NotImplementedError
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns everything but weights that the next losses depend on: tensors, numbers and text,
-        in lists and dictionaries."""
+        """Returns the state, without weights, of the next losses: tensors, numbers and text."""
         return {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -52,8 +52,7 @@ _LIMIT = 1 << 30  # [bytes] of the cache; the files that were used last stay.
 
 
 class WorldCache:
-    """Cache of training worlds and their times of arrival in the user's folder. It depends on the
-    version of the program. A folder that cannot be written stays empty."""
+    """Cache of training worlds and times of arrival, in the user's folder if it can be written."""
 
     def __init__(self) -> None:
         folder = cache_folder("worlds")
@@ -69,8 +68,7 @@ class WorldCache:
         return make(config, dump_config(config), seed, self._program)
 
     def arrival(self, world: "TrainingWorld", voxel_size: float) -> tuple[Esdf, TimeOfArrival]:
-        """Returns the conservative distances and the times of arrival in a world, on grids of
-        `voxel_size` [m]."""
+        """Returns conservative distances and times of arrival, on grids of `voxel_size` [m]."""
         surfaces, p_WG = world.surfaces, world.p_WG
         if isinstance(surfaces, Esdf):
             parts = [surfaces.distances, surfaces.states, surfaces.lower_W, surfaces.voxel_size]
@@ -176,9 +174,8 @@ class WorldBatch:
         return empty
 
     def direction(self, p_WQ: Tensor, world: Tensor) -> Tensor:
-        """Computes directions (N, 3) of the paths to the goals at p_WQ (N, 3) [m] in `world` (N,).
-        They follow the negative gradient of the time of arrival, and are straight near the goal and
-        without a gradient."""
+        """Computes directions (N, 3) at p_WQ (N, 3) [m] down the time of arrival; straight near the
+        goal and without a gradient."""
         to_goal = self.p_WG[world] - p_WQ
         if self._times is None:
             return torch.nn.functional.normalize(to_goal, dim=1)
@@ -188,8 +185,7 @@ class WorldBatch:
         return torch.nn.functional.normalize(downhill, dim=1)
 
     def clearance(self, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
-        """Computes distances (N,) [m] of vehicles at p_WQ (N, 3) [m] in `world` (N,) to the nearest
-        obstacle beyond their radius, and whether they are inside the volume (N,)."""
+        """Computes clearances (N,) [m] at p_WQ (N, 3) [m], and whether it is in the volume (N,)."""
         distances, _ = self.geometry.nearest(p_WQ, world, 1)
         inside = (p_WQ > self.lower_W[world]) & (p_WQ < self.upper_W[world])
         return distances[:, 0] - VEHICLE_RADIUS, inside.all(1)
@@ -204,8 +200,7 @@ class WorldBatch:
         return None if self.views is None else self.views.render(vehicle, world)
 
     def distance(self, p_WQ: Tensor, world: Tensor) -> Tensor:
-        """Interpolates signed distances (N,) [m] at p_WQ (N, 3) [m] in `world` (N,); the bounds of
-        the volume count as surfaces."""
+        """Interpolates distances (N,) [m] at p_WQ (N, 3) [m] to surfaces and the volume's faces."""
         return self._distances.interpolate(p_WQ, world)[0]
 
 
@@ -302,12 +297,8 @@ def _make_worlds(
 
 
 class WorldViews:
-    """The Gaussians of the worlds of a `WorldBatch`, seen by the vehicles' cameras.
-
-    Args:
-        count, first: number of worlds, and the seed of the first, as in `training_worlds`.
-        camera: its `merged_spread` may be larger in training than in flight.
-    """
+    """Renders the worlds of a `WorldBatch`, `count` from the seed `first`, from vehicles' cameras.
+    The camera's `merged_spread` may be larger than in flight."""
 
     def __init__(
         self, selection: WorldSelection, count: int, first: int, camera: OnboardCamera
@@ -343,8 +334,7 @@ class WorldViews:
 
     @torch.no_grad()
     def render(self, vehicle: Vehicle, world: Tensor) -> Tensor:
-        """Renders colors (N, H, W, 3), uint8, from the vehicles' cameras, each in its `world`
-        (N,)."""
+        """Renders colors (N, H, W, 3), uint8, from the vehicles' cameras in `world` (N,)."""
         poses = (part.double().cpu().numpy() for part in camera_poses(vehicle))
         X_WCs = [
             RigidTransform(RotationMatrix.ProjectToRotationMatrix(R_WC), p_WC)

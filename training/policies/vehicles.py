@@ -50,9 +50,8 @@ class PointMass(NamedTuple):
         return thrust + torch.tensor([0.0, 0.0, params.gravity], device=thrust.device)
 
     def step(self, a_cmd: Tensor, dt: float, heading: Tensor | None = None) -> "PointMass":
-        """Computes the state after `dt` [s] of constant commanded accelerations (N, 3) [m/s^2].
-        Exact for da/dt = (a_cmd - a) / lag. The vehicle turns toward `heading` (N,) [rad], or along
-        the velocity, as under the controller."""
+        """Computes the state after `dt` [s] of commanded accelerations (N, 3) [m/s^2], exact for
+        da/dt = (a_cmd - a) / lag, turning toward `heading` (N,) [rad] or along the velocity."""
         decay = torch.exp(-dt / self.lag)
         behind = self.a - a_cmd
         # Fused operations: with few vehicles, their number determines the time.
@@ -163,8 +162,7 @@ def choose_rows(chosen: Tensor, these: Any, others: Any) -> Any:
 
 
 class History(NamedTuple):
-    """The last states of N vehicles, and the times of their images, as by
-    `systems.sensing.latency.DelayedPose` with the steps of the policy as samples."""
+    """The last states of N vehicles and times of images, as by `DelayedPose`, sampled by steps."""
 
     past: Any  # vehicles with tensors (N, K, ...), oldest first, without gradient
     delays: Tensor  # (N, CYCLE) [s], or (N, 1) of images that are taken at each step
