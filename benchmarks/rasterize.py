@@ -31,8 +31,7 @@ SIZES = ((160, 120), (320, 240), (640, 480))
 
 
 def hospital(count: int) -> tuple[GaussianScene, RigidTransform]:
-    """Back-projects a regular grid of pixels of every tenth frame, and returns `count` round
-    Gaussians and a camera's pose X_WC among them."""
+    """Returns `count` back-projected Gaussians of every tenth frame, and a pose X_WC among them."""
     capture = read_capture(find_data(Path("tartanair/hospital"), "TartanAir's hospital"))
     step = 4 if count <= 150_000 else 2
     means, scales, colors = [], [], []

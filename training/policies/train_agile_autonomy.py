@@ -1,8 +1,8 @@
 """Trains Agile Autonomy: imitation of an expert that samples trajectories and knows the world.
 
-After "Learning High-Speed Flight in the Wild" (A. Loquercio et al., Science Robotics 2021). Different
-here: the expert is `systems.policies.lattice` instead of a Metropolis-Hastings sampler; a trained
-encoder of 32x24 pixels instead of a frozen MobileNet; dense layers; the expert's much worse
+After "Learning High-Speed Flight in the Wild" (A. Loquercio et al., Science Robotics 2021).
+Different here: the expert is `systems.policies.lattice` instead of a Metropolis-Hastings sampler; a
+trained encoder of 32x24 pixels instead of a frozen MobileNet; dense layers; the expert's much worse
 trajectories are not imitated; contact costs 2 at the vehicle's own radius instead of 0.3 m; a meter
 toward the goal reduces the cost by 0.1 when a hypothesis is chosen.
 """
