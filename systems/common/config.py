@@ -86,11 +86,8 @@ class RegistryField(dataclasses.Field):
 
 
 def registry_field(registry: Registry, default: Callable[[], Any]) -> Any:
-    """Declares a field for any configuration of a registry, which a tag names in YAML.
-
-    Args:
-        default: type of configurations that need no tag, or `dict` for a dictionary by name.
-    """
+    """Declares a field for any configuration of a registry, or a dictionary of them if `default` is
+    `dict`. In YAML a tag names their types; the type `default` needs none."""
     return RegistryField(registry, default)
 
 
@@ -99,16 +96,12 @@ def load_config[Configuration](
     path: str | Path | None = None,
     overrides: Sequence[str] | None = None,
 ) -> Configuration:
-    """Reads a configuration file and applies overrides of single fields.
+    """Reads a YAML file, if any, and applies overrides of single fields.
 
     Args:
         defaults: configuration with the values of all other fields.
-        path: YAML file, or None.
         overrides: "dotted.field=YAML value" each, applied in order after the file; or "NAME=FILE",
             with the fields of a YAML file, of a name in `defaults.OVERLAYS`.
-
-    Raises:
-        ValueError: naming the file or override, and the field with its likely spelling.
     """
     config = defaults if path is None else parse_config(defaults, read_text(Path(path)), str(path))
     for override in overrides or ():
@@ -119,20 +112,16 @@ def load_config[Configuration](
             with yaml_errors(str(file)):
                 root = yaml.compose(read_text(file), yaml.SafeLoader)
             config = _with_fields(config, root, [], str(file))
-            continue
-        config = _with_field(config, name.split("."), value, f"override {override!r}")
+        else:
+            config = _with_field(config, name.split("."), value, f"override {override!r}")
     return config
 
 
 def parse_config[Configuration](
     defaults: Configuration, text: str, source: str, prefix: str = ""
 ) -> Configuration:
-    """Reads a configuration from a YAML text; for errors see `load_config`.
-
-    Args:
-        source: name of the text, for messages.
-        prefix: path of `defaults`, for messages, such as "policy.".
-    """
+    """Reads a configuration from a YAML text. Messages name the `source`, and fields by their paths
+    with a `prefix`, that of `defaults`, such as "policy."."""
     with yaml_errors(source):
         given = yaml_load_data(text, private=True)
         try:
@@ -251,10 +240,8 @@ def _put(config: Any, path: FieldPath, distribution: Any, prefix: str) -> None:
 
 
 def _check_names(config: Any, given: Any, prefix: str, kinds: Sequence[Any] = ()) -> None:
-    """Raises ValueError for unknown fields, with their likely spelling, and for wrong types.
-
-    `kinds` are the types that a tag may name.
-    """
+    """Raises ValueError for unknown fields, with their likely spelling, and for wrong types. A tag
+    may name `kinds`."""
     if is_distribution(config):
         return
     if isinstance(given, dict) and "_tag" in given:
@@ -465,16 +452,12 @@ def _texts(config: type) -> dict[str, str]:
     assert isinstance(definition, ast.ClassDef)
     texts = {}
     for statement, following in zip_longest(definition.body, definition.body[1:]):
-        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
-            text = _string(following) or _comment(lines, statement)
-            if text:
-                texts[statement.target.id] = " ".join(text.split())
+        match statement, following:
+            case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(str(text))):
+                texts[name] = " ".join(text.split())
+            case ast.AnnAssign(target=ast.Name(name)), _:
+                texts[name] = _comment(lines, statement)
     return texts
-
-
-def _string(statement: ast.stmt | None) -> str:
-    value = statement.value if isinstance(statement, ast.Expr) else None
-    return value.value if isinstance(value, ast.Constant) and isinstance(value.value, str) else ""
 
 
 def _comment(lines: list[str], field: ast.stmt) -> str:
@@ -482,13 +465,13 @@ def _comment(lines: list[str], field: ast.stmt) -> str:
     assert field.end_lineno is not None
     after = lines[field.end_lineno - 1].encode()[field.end_col_offset :].decode().strip()
     if after.startswith("#"):
-        return after.lstrip("# ")
+        return " ".join(after.lstrip("# ").split())
     above = []
     for line in reversed(lines[: field.lineno - 1]):
         if not line.strip().startswith("#"):
             break
         above.insert(0, line.strip().lstrip("# "))
-    return " ".join(above)
+    return " ".join(" ".join(above).split())
 
 
 def _class_text(value: Any) -> str:

@@ -14,9 +14,8 @@ def import_extra(module: str, extra: str) -> ModuleType:
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"{error.name} is not installed; pip install 'splatpilot[{extra}]'", name=error.name
-        ) from None
+        message = f"{error.name} is not installed; pip install 'splatpilot[{extra}]'"
+        raise ModuleNotFoundError(message, name=error.name) from None
 
 
 def missing_extra(error: ModuleNotFoundError, needed_by: str) -> str | None:

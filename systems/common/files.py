@@ -151,11 +151,9 @@ def require_writable_folder(path: Path) -> None:
 
 
 def claim_folder(file: Path, config: Any, overwrite: bool = False) -> str:
-    """Writes `config` to `file`, whose folder belongs to that configuration from then on.
-
+    """Writes `config` to `file`, whose folder belongs to it from then on, and returns it as YAML.
     Raises ValueError for a folder with another configuration, or with files but without one, unless
-    `overwrite` is true. Returns the configuration as YAML.
-    """
+    `overwrite` is true."""
     from splatpilot.systems.common.config import dump_config, load_config  # imports Drake
 
     require_writable_folder(file.parent)
@@ -182,11 +180,8 @@ def claim_folder(file: Path, config: Any, overwrite: bool = False) -> str:
 
 @contextmanager
 def locked_folder(path: Path) -> Iterator[None]:
-    """Locks the folder `path`, made if it is missing, for this process while the block runs.
-
-    The lock ends with the process. A folder that was made here and stays empty is removed. Raises
-    OSError if another process has locked it.
-    """
+    """Locks the folder `path`, made if it is missing, for this process while the block runs; raises
+    OSError if another has locked it. A folder that was made here and stays empty is removed."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     require_writable_folder(path)
     descriptor = os.open(path, os.O_RDONLY)
@@ -248,18 +243,15 @@ def find_data(path: Path, what: str, hint: str = "") -> Path:
     """
     if path.exists():
         return path
-    data = data_folder()
-    if data is not None:
+    where = f"in the folder that {DATA} names (it is not set)"
+    if (data := data_folder()) is not None:
         within = sorted(data.glob(f"*/{path}")) if len(path.parts) == 1 else []
-        for found in (data / path, *within):
-            if found.exists():
-                print(f"{path} is {found}")
-                return found
-    where = f"in {data}" if data is not None else f"in the folder that {DATA} names (it is not set)"
-    raise FileNotFoundError(
-        f"No such file or folder: {path}; expected {what}, here or {where}"
-        + (f"; {hint}" if hint else "")
-    )
+        for found in filter(Path.exists, (data / path, *within)):
+            print(f"{path} is {found}")
+            return found
+        where = f"in {data}"
+    message = f"No such file or folder: {path}; expected {what}, here or {where}"
+    raise FileNotFoundError(f"{message}; {hint}" if hint else message)
 
 
 def require_corpus(folder: Path) -> None:
@@ -281,10 +273,10 @@ def require_scene(path: str, source: str = "") -> Path:
     """Finds a scene, see `locate_scene`; `source` says how to get a missing one."""
     if found := locate_scene(path):
         return found
+    source = source.strip() or "reconstruct one with `splatpilot reconstruct`"
     raise FileNotFoundError(
         f"No such file or folder: {path}; expected a scene, here or in {scenes_folder()} (the "
-        f"environment variable {SCENES} names that folder); "
-        + (source or "reconstruct one with `splatpilot reconstruct`").strip()
+        f"environment variable {SCENES} names that folder); {source}"
     )
 
 

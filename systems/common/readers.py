@@ -50,10 +50,8 @@ def read_text(path: Path, errors: str = "strict") -> str:
     """Reads a text file in UTF-8 of at most `MAX_TEXT` bytes; for `errors` see `open`."""
     require_file(path)
     if (size := path.stat().st_size) > MAX_TEXT:
-        raise ValueError(
-            f"{path} must have at most {MAX_TEXT / 1e6:g} MB, got {size / 1e6:.3g} MB; choose "
-            "another file"
-        )
+        limit, remedy = f"at most {MAX_TEXT / 1e6:g} MB", "choose another file"
+        raise ValueError(f"{path} must have {limit}, got {size / 1e6:.3g} MB; {remedy}")
     try:
         return path.read_text(encoding="utf-8-sig", errors=errors)
     except UnicodeDecodeError as error:
