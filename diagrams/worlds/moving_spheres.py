@@ -13,7 +13,6 @@ from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan, even_direction
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.shapes import MovingSpheres, Sphere
 from splatpilot.systems.common.validation import Config, bounded, require_field
-from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.moving_bodies import MovingObstacles
 from splatpilot.systems.splats.scene import GaussianScene
 
@@ -48,9 +47,8 @@ class MovingSphere(Config):
 def add_moving_spheres(world: World, spheres: Mapping[str, MovingSphere]) -> World:
     """Returns the world with the spheres, at least one, among its moving obstacles."""
     radii, paths = zip(*((each.radius, each.path()) for each in spheres.values()), strict=True)
-    moving = MovingSpheres(radii, paths, PERIOD)
     bodies = [_draw_sphere(radius) for radius in radii]
-    obstacles = MovingObstacles(moving, MovingGaussians(bodies, moving.centers))
+    obstacles = MovingObstacles(MovingSpheres(radii, paths, PERIOD), bodies)
     if world.moving is not None:
         obstacles = world.moving.merged_with(obstacles)
     return replace(world, moving=obstacles)
@@ -208,4 +206,4 @@ def dodgedrone_world(config: DodgeDroneConfig, seed: int) -> World:
         solid = Solid(Sphere(center, obstacle.radius), _MOVING)
         body = draw(replace(spec, solids=[solid], **large), [solid], sun)
         bodies.append(replace(body, means=body.means - center.astype(np.float32)))
-    return replace(world, moving=MovingObstacles(spheres, MovingGaussians(bodies, spheres.centers)))
+    return replace(world, moving=MovingObstacles(spheres, bodies))

@@ -45,34 +45,6 @@ def placed_together(parts: "Sequence[GaussianScene | PlacedGaussians]") -> Place
     return PlacedGaussians(**concatenated(parts)) if parts else NO_GAUSSIANS
 
 
-class MovingGaussians:
-    """M bodies of Gaussians that move without rotating.
-
-    Args:
-        bodies: each about its own center.
-        centers: from a time [s] to the centers (M, 3) [m]; infinite for an absent body.
-    """
-
-    def __init__(
-        self, bodies: Sequence[GaussianScene], centers: Callable[[float], NDArray]
-    ) -> None:
-        self.bodies = list(bodies)
-        self._about_centers = placed_together(bodies)
-        self._body = np.repeat(np.arange(len(bodies)), [len(body) for body in bodies])
-        self._centers = centers
-
-    def at(self, time: float) -> PlacedGaussians:
-        """Returns the Gaussians at a time [s]; those of absent bodies have no opacity."""
-        centers = self._centers(time)
-        present = np.isfinite(centers).all(axis=1)
-        own = self._about_centers
-        offsets = np.where(present[:, None], centers, 0.0).astype(np.float32)
-        placed = own._replace(means=own.means + offsets[self._body])
-        if present.all():
-            return placed
-        return placed._replace(opacities=own.opacities * present[self._body])
-
-
 def create_renderer(threads: int = 1, simd: str = "") -> _native.Renderer:
     """Creates CPU threads and memory for several images, which do not depend on either.
 

@@ -1,5 +1,6 @@
 """Bodies that move in a scene: Gaussians for cameras, and spheres around them for collisions."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, cast
 
@@ -13,7 +14,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 from splatpilot.systems.collision.shapes import MovingSpheres, SpheresInTime
 from splatpilot.systems.common.drake import output_port, weak_callback
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.baked_scene import MovingGaussians, PlacedGaussians, placed_together
+from splatpilot.systems.splats.baked_scene import PlacedGaussians, placed_together
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.state import pose_between
 
@@ -22,18 +23,29 @@ _MEMORY = 100  # number of remembered poses: 2 s
 _ROW = 8  # numbers of one: time, position and quaternion (wxyz)
 
 
-@dataclass(frozen=True, eq=False)
 class MovingObstacles:
-    """Obstacles whose positions depend on time alone."""
+    """Obstacles that move in time without rotating: spheres for collisions, and for cameras bodies
+    of Gaussians, each about its own center."""
 
-    spheres: MovingSpheres  # for collisions
-    gaussians: MovingGaussians  # for cameras
+    def __init__(self, spheres: MovingSpheres, bodies: Sequence[GaussianScene]) -> None:
+        self.spheres, self.bodies = spheres, list(bodies)
+        self._about_centers = placed_together(bodies)
+        self._body = np.repeat(np.arange(len(bodies)), [len(body) for body in bodies])
+
+    def gaussians(self, time: float) -> PlacedGaussians:
+        """Returns the Gaussians at a time [s]; those of absent bodies have no opacity."""
+        centers, own = self.spheres.centers(time), self._about_centers
+        present = np.isfinite(centers).all(axis=1)
+        offsets = np.where(present[:, None], centers, 0.0).astype(np.float32)
+        placed = own._replace(means=own.means + offsets[self._body])
+        if present.all():
+            return placed
+        return placed._replace(opacities=own.opacities * present[self._body])
 
     def merged_with(self, other: "MovingObstacles") -> "MovingObstacles":
         """Returns the obstacles of both."""
         spheres = self.spheres.merged_with(other.spheres)
-        bodies = [*self.gaussians.bodies, *other.gaussians.bodies]
-        return MovingObstacles(spheres, MovingGaussians(bodies, spheres.centers))
+        return MovingObstacles(spheres, [*self.bodies, *other.bodies])
 
 
 class Track(NamedTuple):
@@ -87,7 +99,7 @@ class Bodies(SpheresInTime):
         """Returns the Gaussians at a time [s]."""
         placed = [track.gaussians.transformed_by(track.pose(time)) for track in self.tracks]
         if self.obstacles:
-            placed = [self.obstacles.gaussians.at(time), *placed]
+            placed = [self.obstacles.gaussians(time), *placed]
         return placed_together(placed)
 
 

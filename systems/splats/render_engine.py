@@ -115,7 +115,7 @@ class ObstacleGeometry(LeafSystem):
     ) -> "ObstacleGeometry":
         """Registers the obstacles for a `SplatRenderEngine`, and adds the system of their poses."""
         source, frames = scene_graph.RegisterSource(name), []
-        bodies = zip(obstacles.spheres.radii, obstacles.gaussians.bodies, strict=True)
+        bodies = zip(obstacles.spheres.radii, obstacles.bodies, strict=True)
         for index, (radius, gaussians) in enumerate(bodies):
             obstacle = f"obstacle_{index}"
             frames.append(scene_graph.RegisterFrame(source, GeometryFrame(obstacle)))

@@ -23,7 +23,6 @@ from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, HalfSpace, MovingSpheres
 from splatpilot.systems.common.config import dump_config, parse_config
 from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.moving_bodies import MovingObstacles
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
@@ -47,8 +46,7 @@ def with_sphere(world: World, path: np.ndarray) -> World:
     red = np.tile([1.0, 0.0, 0.0], (300, 1))
     sphere = GaussianScene.from_colors(0.5 * directions, quats, scales, np.full(300, 0.99), red)
     spheres = MovingSpheres([0.5], [path], 0.02)
-    gaussians = MovingGaussians([sphere], spheres.centers)
-    return replace(world, moving=MovingObstacles(spheres, gaussians))
+    return replace(world, moving=MovingObstacles(spheres, [sphere]))
 
 
 def falling(x: float, y: float, speed: float) -> np.ndarray:
@@ -69,7 +67,7 @@ def test_cameras_planner_and_collision_meet_a_body_of_the_user(post_world):
     X_WO = RigidTransform(post_world.p_WS + np.array([2.0, 0.0, 0.0]))
     source = ConstantValueSource(Value(X_WO))
     pose = builder.AddSystem(source).get_output_port()
-    red = with_sphere(post_world, falling(0.0, 0.0, 1.0)).moving.gaussians.bodies[0]
+    red = with_sphere(post_world, falling(0.0, 0.0, 1.0)).moving.bodies[0]
     AddMovingBody(builder, parts, "body", red, 0.5, pose)
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()

@@ -5,7 +5,6 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, HalfSpace, MovingSpheres
 from splatpilot.systems.sensing.imu import RangeFinder, RangeFinderSensor
-from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.moving_bodies import Bodies, MovingObstacles
 from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_gaussians
 from tests.systems.vehicle.responses import evaluate
@@ -39,7 +38,7 @@ def test_the_range_is_along_the_ray(X_WB, expected):
 
 def test_moving_bodies_are_hit():
     spheres = MovingSpheres([0.5], [np.array([[0.0, 0.0, 1.5]])], 1.0)
-    obstacles = MovingObstacles(spheres, MovingGaussians([quadrotor_gaussians()], spheres.centers))
+    obstacles = MovingObstacles(spheres, [quadrotor_gaussians()])
     X_WB = RigidTransform([0.0, 0.0, 3.0])
     assert measure(X_WB, bodies=Bodies(0.0, obstacles)) == pytest.approx(1.0, abs=1e-3)
 

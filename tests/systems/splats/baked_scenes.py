@@ -5,7 +5,6 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot import _native
 from splatpilot.systems.collision.shapes import MovingSpheres
-from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.moving_bodies import MovingObstacles
 from splatpilot.systems.splats.scene import GaussianScene
 
@@ -45,8 +44,7 @@ def wall(axis: int, at: float, opacity: float = 0.99, reach: float = 30.0) -> Ga
 
 def moving(gaussians: GaussianScene, path, period: float = 1.0, radius=0.5) -> MovingObstacles:
     """An obstacle of Gaussians about its center that follows a path (n, 3) [m], a row a period."""
-    spheres = MovingSpheres([radius], [np.array(path)], period)
-    return MovingObstacles(spheres, MovingGaussians([gaussians], spheres.centers))
+    return MovingObstacles(MovingSpheres([radius], [np.array(path)], period), [gaussians])
 
 
 def plane(X_WP: RigidTransform, half: float, step: float) -> GaussianScene:

@@ -19,15 +19,16 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from random_scenes import random_scene as random_gaussians
 from reference_rasterizer import median_depth
 
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import (
     BakedScene,
     BatchRenderer,
-    MovingGaussians,
     create_renderer,
     placed_together,
 )
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
+from splatpilot.systems.splats.moving_bodies import MovingObstacles
 from splatpilot.systems.splats.rasterization import rasterize
 from splatpilot.systems.splats.scene import ARRAYS, GaussianScene
 
@@ -256,10 +257,11 @@ def test_median_depth_has_no_gradient():
 def test_a_moving_body_is_drawn_like_a_static_one_and_an_absent_one_not():
     scene, body = random_scene(2048, seed=1, sh_degree=1), random_scene(300, seed=2, sh_degree=0)
     center = np.array([0.3, 0.2, 0.5])
-    moving = MovingGaussians([body] * 2, lambda time: np.stack([time * center, [np.inf] * 3]))
+    paths = [np.stack([0.0 * center, center]), np.full((1, 3), np.inf)]
+    moving = MovingObstacles(MovingSpheres([1.0, 1.0], paths, 1.0), [body] * 2)
     merged = BakedScene(scene.merged_with(body.transformed_by(RigidTransform(center))))
     expected = merged.render(*CAMERA, X_WC, background=(0.1, 0.2, 0.3))
-    options = {"background": (0.1, 0.2, 0.3), "moving": moving.at(1.0)}
+    options = {"background": (0.1, 0.2, 0.3), "moving": moving.gaussians(1.0)}
     view = BakedScene(scene).render(*CAMERA, X_WC, **options)
     np.testing.assert_allclose(view.color, expected.color, rtol=0, atol=2e-3)
     np.testing.assert_allclose(view.alpha, expected.alpha, rtol=0, atol=2e-3)
