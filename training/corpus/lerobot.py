@@ -32,15 +32,13 @@ _STATE = [f"p_WB_{axis}" for axis in "xyz"] + [f"q_WB_{axis}" for axis in "wxyz"
 _STATE += [f"{vector}_{axis}" for vector in ("v_B", "goal_B") for axis in "xyz"]
 _TIMES = [WAYPOINT_PERIOD * (n + 1) for n in range(NUM_WAYPOINTS)]
 _ACTION = [f"{axis}_{time:.1f}s" for time in _TIMES for axis in "xyz"]
-_COLUMNS: dict[str, tuple[str, list[str] | None]] = {
-    "observation.state": ("float32", _STATE),
-    "action": ("float32", _ACTION),
-    "timestamp": ("float32", None),
-    "frame_index": ("int64", None),
-    "episode_index": ("int64", None),
-    "index": ("int64", None),
-    "task_index": ("int64", None),
-}
+_NAMES = {"observation.state": _STATE, "action": _ACTION}
+_INDICES = "frame_index", "episode_index", "index", "task_index"
+_SCHEMA = pa.schema(
+    {name: pa.list_(pa.float32(), len(names)) for name, names in _NAMES.items()}
+    | {"timestamp": pa.float32()}
+    | dict.fromkeys(_INDICES, pa.int64())
+)
 _LOSSLESS = {"preset": "ultrafast", "x265-params": "lossless=1:keyint=2:log-level=none"}
 # Encoder, its format, the format of images and options, by channels; depth maps are lossless.
 _CODECS = {
@@ -111,9 +109,7 @@ class _Writer:
         self.episodes: list[dict[str, Any]] = []
         self._columns: list[dict[str, np.ndarray]] = []
         self._log_bounds = np.log(np.array([camera.min_depth, camera.max_depth]) + _SHIFT)
-        depths = (
-            np.exp(np.linspace(self._log_bounds[0], self._log_bounds[1], _MAX_CODE + 1)) - _SHIFT
-        )
+        depths = np.exp(np.linspace(*self._log_bounds, _MAX_CODE + 1)) - _SHIFT
         self._values = {COLOR: np.arange(256) / 255, DEPTH: depths}  # of all codes
         self._totals = {COLOR: np.zeros((3, 256), int), DEPTH: np.zeros((1, _MAX_CODE + 1), int)}
 
@@ -125,30 +121,26 @@ class _Writer:
         numbers = {"chunk_index": chunk, "file_index": file}
         rows = np.concatenate(runs)
         near, far = self._log_bounds
-        depth = np.clip(
-            shard.arrays["depth"][rows].astype(float), self.camera.min_depth, self.camera.max_depth
-        )
+        depth = shard.arrays["depth"][rows].astype(float)
+        depth = np.clip(depth, self.camera.min_depth, self.camera.max_depth)
         codes = np.rint(_MAX_CODE * (np.log(depth + _SHIFT) - near) / (far - near))
         images = {COLOR: shard.arrays["color"][rows], DEPTH: codes.astype(np.uint16)[..., None]}
         for key in images:
             self._encode(self._path(_VIDEO, video_key=key, **numbers), images[key])
-        with pq.ParquetWriter(self._path(_DATA, **numbers), _schema()) as parquet:
+        with pq.ParquetWriter(self._path(_DATA, **numbers), _SCHEMA) as parquet:
             first = 0
             for run in runs:
-                part = slice(first, first + len(run))
-                self._add_episode(shard, run, {key: images[key][part] for key in images})
+                end = first + len(run)
+                self._add_episode(shard, run, {key: images[key][first:end] for key in images})
                 columns = self._columns[-1].items()
                 table = {k: (c[:, 0] if c.shape[1] == 1 else c).tolist() for k, c in columns}
-                parquet.write_table(pa.table(table, _schema()))
-                seconds = {
-                    "from": float(part.start / self.rate),
-                    "to": float(part.stop / self.rate),
-                }
-                where = numbers | {f"{end}_timestamp": time for end, time in seconds.items()}
-                self.episodes[-1] |= {f"data/{name}": k for name, k in numbers.items()} | {
-                    f"videos/{key}/{name}": value for key in images for name, value in where.items()
-                }
-                first = part.stop
+                parquet.write_table(pa.table(table, _SCHEMA))
+                times = {"from_timestamp": first / self.rate, "to_timestamp": end / self.rate}
+                video = numbers | {name: float(time) for name, time in times.items()}
+                self.episodes[-1] |= {f"data/{name}": k for name, k in numbers.items()}
+                for key in images:
+                    self.episodes[-1] |= {f"videos/{key}/{name}": video[name] for name in video}
+                first = end
         self.files += 1
 
     def _path(self, pattern: str, **numbers: Any) -> Path:
@@ -168,18 +160,16 @@ class _Writer:
             container.mux(stream.encode())
 
     def _add_episode(self, shard: Shard, run: np.ndarray, images: dict[str, np.ndarray]) -> None:
-        count, number = len(run), len(self.episodes)
-        values = {name: array[run] for name, array in shard.arrays.items() if array.ndim < 5}
-        X_WB = values["X_WB"]
-        state = X_WB[:, 4:], X_WB[:, :4], values["v_B"], values["goal_B"]
+        count, number, frame = len(run), len(self.episodes), np.arange(len(run))[:, None]
+        X_WB, v_B, goal_B, trajectories_B = (
+            shard.arrays[name][run] for name in ("X_WB", "v_B", "goal_B", "trajectories_B")
+        )
+        indices = frame, np.full_like(frame, number), self.frames + frame, np.zeros_like(frame)
         columns = {
-            "observation.state": np.concatenate(state, axis=1),
-            "action": values["trajectories_B"][:, 0].reshape(count, -1),
-            "timestamp": np.arange(count)[:, None] / float(self.rate),
-            "frame_index": np.arange(count)[:, None],
-            "episode_index": np.full((count, 1), number),
-            "index": self.frames + np.arange(count)[:, None],
-            "task_index": np.zeros((count, 1), int),
+            "observation.state": np.concatenate([X_WB[:, 4:], X_WB[:, :4], v_B, goal_B], axis=1),
+            "action": trajectories_B[:, 0].reshape(count, -1),
+            "timestamp": frame / float(self.rate),
+            **dict(zip(_INDICES, indices, strict=True)),
         }
         self._columns.append(columns)
         stats = {name: _stats(column) for name, column in columns.items()}
@@ -229,10 +219,10 @@ class _Writer:
         camera = self.camera
         bounds = {"depth_min": camera.min_depth, "depth_max": camera.max_depth}
         coding = bounds | {"shift": _SHIFT, "use_log": True}
-        features: dict[str, Any] = {
-            name: {"dtype": dtype, "shape": [len(names or "1")], "names": names}
-            for name, (dtype, names) in _COLUMNS.items()
-        }
+        features: dict[str, Any] = {}
+        for name in _SCHEMA.names:
+            dtype, names = "int64" if name in _INDICES else "float32", _NAMES.get(name)
+            features[name] = {"dtype": dtype, "shape": [len(names or "1")], "names": names}
         for key, channels, codec, about in ((COLOR, 3, "h264", {}), (DEPTH, 1, "hevc", coding)):
             about = {"codec": codec, "pix_fmt": _CODECS[channels][1], "fps": fps} | about
             info = {f"video.{name}": value for name, value in about.items()}
@@ -240,16 +230,6 @@ class _Writer:
             size, names = [camera.height, camera.width, channels], ["height", "width", "channels"]
             features[key] = {"dtype": "video", "shape": size, "names": names, "info": info}
         return features
-
-
-def _schema() -> pa.Schema:
-    types = {name: (pa.type_for_alias(dtype), names) for name, (dtype, names) in _COLUMNS.items()}
-    return pa.schema(
-        {
-            name: pa.list_(each, len(names)) if names else each
-            for name, (each, names) in types.items()
-        }
-    )
 
 
 def _stats(column: np.ndarray) -> dict[str, list]:
