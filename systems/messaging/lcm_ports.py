@@ -39,8 +39,7 @@ class BridgeStatus(LeafSystem):
         output_ports: [status, observation_age]
 
     - ``s_age``, ``s_gaps``, ``s_rejected`` (1 each) of each input ``s``: see `MessageSubscriber`.
-    - ``overruns`` (1), optional: number of ticks that ended too late.
-    - ``mode`` (2): see `Failsafe`.
+    - ``overruns`` (1), optional: number of ticks that ended too late. ``mode`` (2): see `Failsafe`.
     - ``status`` (7): mode and reason; ages of the state and of the oldest image [s]; sums of gaps
       and of rejected messages; overruns.
     - ``observation_age`` (1): of the oldest image [s], 0 without images.
@@ -117,11 +116,10 @@ def open_lcm(url: str = DEFAULT_URL) -> LCM:
     if not url.startswith(("udpm://", "memq://")):
         raise OSError(f"the LCM URL must begin with udpm:// or memq://, got {url!r}")
     with open(os.devnull) as file:
-        if file.fileno() >= _MAX_FILES:
-            raise OSError(
-                f"LCM cannot use {url}: at most {_MAX_FILES} files may be open in this process, "
-                f"got {file.fileno()}; close some"
-            )
+        number = file.fileno()
+    if number >= _MAX_FILES:
+        limit = f"at most {_MAX_FILES} files may be open in this process, got {number}; close some"
+        raise OSError(f"LCM cannot use {url}: {limit}")
     remedy = (
         "use a multicast group and a port that only LCM has, and give the host a multicast route "
         "(ip route add 224.0.0.0/4 dev lo)"

@@ -36,10 +36,9 @@ class Received:
 class Receiver[R: Received](LeafSystem):
     """Base of systems that take all messages of a `source` every `period` [s] from time 0.
 
-    The update is unrestricted, so that discrete updates of the same instant see it. The output
-    ``rejected`` (1) counts messages that could not be used; reasons are logged at the first,
-    second, fourth, eighth... `now` is the Unix time [s] of a process that runs with the wall
-    clock; by default it is the input `unix_time`.
+    The update is unrestricted: discrete updates of the same instant see it. The output ``rejected``
+    (1) counts messages that could not be used; reasons are logged at the first, second, fourth,
+    eighth... `now` is the Unix time [s] by the wall clock; by default the input `unix_time`.
     """
 
     def __init__(
@@ -86,7 +85,7 @@ class Receiver[R: Received](LeafSystem):
 
     def _time_of_reading(self, context: Context) -> float:
         """Returns the Unix time [s] after messages have been read. By the Context's time, which may
-        be behind the wall clock, messages would seem to have come before they were sent."""
+        be behind, they would seem to have come before they were sent."""
         return self._now() if self._now else float(vector_input(self, "unix_time", context)[0])
 
     def _take(
@@ -237,12 +236,9 @@ class TimeOfFlightReceiver(Receiver[_Grid]):
         weakref.finalize(self, inbox.close)
         self._sensor, self._inbox, self.port = config.sensor, inbox, inbox.port
         self._waiting: list[tuple[list[bytes], int]] = []
-        shape, latency = (config.sensor.rows, config.sensor.columns), config.latency
-        self._declare(
-            "depth_grid",
-            math.prod(shape),
-            lambda got, _: np.zeros(shape) if got.stream.grid is None else got.stream.grid,
-        )
+        latency, empty = config.latency, np.zeros((config.sensor.rows, config.sensor.columns))
+        grid = lambda got, _: empty if got.stream.grid is None else got.stream.grid  # noqa: E731
+        self._declare("depth_grid", empty.size, grid)
         self._declare("age", 1, lambda got, now: now - got.time + latency, timed=True)
         self._declare("gaps", 1, lambda got, _: got.stream.gaps)
 

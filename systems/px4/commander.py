@@ -207,10 +207,9 @@ class Px4Commander(LeafSystem):
         if self._has_come(context, "setpoint_age") and not is_due:
             self._publish_setpoint(context)
         if self._has_come(context, "motion_capture_age"):
-            pose = vector_input(self, "motion_capture_pose", context)
-            age = vector_input(self, "motion_capture_age", context)[0]
-            # MAVLink has no time before its epoch.
-            exposed = max(vector_input(self, "unix_time", context)[0] - age, 0.0)
+            names = "motion_capture_pose", "motion_capture_age", "unix_time"
+            pose, age, unix_time = (vector_input(self, name, context) for name in names)
+            exposed = max(unix_time[0] - age[0], 0.0)  # MAVLink has no time before its epoch.
             self._send(self._mavlink.odometry(pose, round(exposed * 1e6)))
 
     def _publish_setpoint(self, context: Context) -> None:
@@ -229,8 +228,7 @@ class Px4Commander(LeafSystem):
 
     def _publish(self, context: Context) -> None:
         now, memory = context.get_time() - PUBLISH_OFFSET, _Memory.read(context)
-        tick = round(now / _PERIOD)
-        if tick % round(_HEARTBEAT_PERIOD / _PERIOD) == 0:
+        if round(now / _PERIOD) % round(_HEARTBEAT_PERIOD / _PERIOD) == 0:
             self._send(self._mavlink.heartbeat())
         self._publish_setpoint(context)
         if abs(now - memory.asked) < 0.5 * _PERIOD and (request := self._request(context)):

@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from splatpilot.systems.common.extras import import_extra
-from splatpilot.systems.common.validation import Config, bounded, require_field
+from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.messaging.receiver import RESTART, Received, Receiver, UdpConfig, UdpInbox
 from splatpilot.systems.px4.mavlink import pose_from_optitrack
 
@@ -82,8 +82,8 @@ class MotionCaptureReceiver(Receiver[_Pose]):
             if frame is None:
                 return last
             number = frame.prefix.frame_number
-            if number <= last.number and now - last.came <= RESTART:
-                raise ValueError(f"frame must be newer than {last.number}, got {number}")
+            is_new = number > last.number or now - last.came > RESTART
+            require(is_new, "frame", f"newer than {last.number}", number)
             last = replace(last, number=number, came=now)
             return last if pose is None else replace(last, pose=pose, time=now - self._latency)
 
@@ -93,8 +93,7 @@ class MotionCaptureReceiver(Receiver[_Pose]):
         """Reads a frame of data; returns None for other types of messages."""
         buffer = self._natnet.PacketBuffer(packet)
         kind, size = buffer.read_uint16(), buffer.read_uint16()
-        if size != len(packet) - 4:
-            raise ValueError(f"the packet must have {size + 4} bytes, got {len(packet)}")
+        require(size == len(packet) - 4, "the packet", f"of {size + 4} bytes", len(packet))
         if kind != _FRAME_OF_DATA:
             return None
         return self._natnet.DataFrame.read_from_buffer(buffer, self._version)

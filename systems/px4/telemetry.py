@@ -9,6 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from pydrake.systems.framework import Context
 
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
 from splatpilot.systems.messaging.receiver import RESTART, Inbox, Received, Receiver
 from splatpilot.systems.px4 import mavlink
@@ -80,11 +81,9 @@ class _Telemetry(Received):
         received = self
         if last is not None and message.time <= last.time:
             has_restarted = message.time < last.time - RESTART and unix_time - self.came > RESTART
-            if not has_restarted:
-                raise ValueError(
-                    f"{type(message).__name__.lower()} must be newer than {last.time:.3f} s after "
-                    f"PX4 began, got {message.time:.3f} s"
-                )
+            condition = f"newer than {last.time:.3f} s after PX4 began"
+            what, time = type(message).__name__.lower(), f"{message.time:.3f} s"
+            require(has_restarted, what, condition, time)
             received = replace(self, offset=_Offset(), position=None, attitude=None)
         offset = received.offset.heard(message.time, unix_time)
         received = replace(received, offset=offset, came=unix_time)
