@@ -8,7 +8,7 @@ import socket
 import lcm
 import numpy as np
 import pytest
-from natnet_frame import natnet_frame
+from harness import natnet_frame
 from px4_stand_in import BOOT, LAND, LOITER, OFFBOARD, POSITION, Px4StandIn
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem

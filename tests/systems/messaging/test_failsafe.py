@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from harness import Harness
 from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.math import RigidTransform
-from pydrake.systems.analysis import Simulator
 
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder
@@ -33,7 +33,7 @@ LAW, VEHICLE = FlatnessControllerConfig(), quadrotor.QuadrotorParams()
 PERIOD = LAW.period
 
 
-class Bench:
+class Bench(Harness):
     """A failsafe and a vehicle that it flies by velocities or by body rates, in steps of 20 ms.
 
     The test gives inputs; the state, which is `age` [s] old, comes by itself, unless the test gives
@@ -52,9 +52,7 @@ class Bench:
         radius: float = VEHICLE.radius,
     ):
         vehicle, self.radius = replace(VEHICLE, radius=radius), radius
-        self.failsafe = Failsafe(config or FailsafeConfig(), LAW, vehicle, *box, field)
-        self.simulator = Simulator(self.failsafe)
-        self.context = self.simulator.get_mutable_context()
+        super().__init__(Failsafe(config or FailsafeConfig(), LAW, vehicle, *box, field))
         self.age, self.by, self.box, self.field = age, by, box, field
         self.state = hover_state(p_WB)
         self.state[3:6] = v_WB
@@ -63,10 +61,6 @@ class Bench:
         self.tick, self.min_room = 0, math.inf
         self.give(velocity_setpoint=[0.0, 0.0, 0.0, 0.5], command=HOVER)
         self.give_state()
-
-    def give(self, **inputs) -> None:
-        for name, value in inputs.items():
-            self.failsafe.GetInputPort(name).FixValue(self.context, np.atleast_1d(value))
 
     def give_state(self, measured: np.ndarray | None = None) -> None:
         """Gives the failsafe a state, that of the vehicle by default."""
@@ -80,7 +74,7 @@ class Bench:
 
     def accelerate(self, a_WB, v_WB=None) -> None:
         """Gives setpoint and command of a policy that desires an acceleration."""
-        state = np.asarray(self.failsafe.GetInputPort("state").Eval(self.context))
+        state = np.asarray(self.system.GetInputPort("state").Eval(self.context))
         command = flatness_command(state, a_WB, state[3:6], math.nan, LAW, VEHICLE)
         setpoint = state[3:6] + RESPONSE_TIME * a_WB if v_WB is None else v_WB
         self.give(velocity_setpoint=[*setpoint, math.nan], command=command)
@@ -92,7 +86,7 @@ class Bench:
             now = self.tick * PERIOD
             self.give_state(None if measured is None else measured(now))
             if desired is not None:
-                state = np.asarray(self.failsafe.GetInputPort("state").Eval(self.context))
+                state = np.asarray(self.system.GetInputPort("state").Eval(self.context))
                 self.accelerate(tracking_acceleration(state[3:6], np.asarray(desired)), desired)
             self.simulator.AdvanceTo(now + 1e-6)
             command = self.out("command")
@@ -115,9 +109,6 @@ class Bench:
             room = min(room, float(self.field.distance(p_WB)) - self.radius - 0.1)
         return room
 
-    def out(self, name: str) -> np.ndarray:
-        return self.failsafe.GetOutputPort(name).Eval(self.context)
-
     def mode(self) -> tuple[float, float]:
         return tuple(self.out("mode"))
 
@@ -130,7 +121,7 @@ def test_a_healthy_policy_is_passed_unchanged():
     given = {"velocity_setpoint": [1.0, 0.5, 0.1, 0.5], "command": [10.0, 0.1, -0.2, 0.3]}
     bench.give(**given)
     bench.advance(0.06)
-    expected = given | {"state_is_known": [1], "is_ready": [1], "in_charge": [1], "mode": FLYING}
+    expected = given | {"state_is_known": 1, "is_ready": 1, "in_charge": 1, "mode": FLYING}
     assert all(np.array_equal(bench.out(port), value) for port, value in expected.items())
 
 
@@ -194,8 +185,8 @@ def test_modes_follow_the_inputs(steps):
     for inputs, duration, mode, in_charge in steps:
         bench.give(**inputs)
         bench.advance(duration)
-        assert (bench.mode(), bench.out("in_charge")[0]) == (mode, in_charge)
-        assert bench.out("is_ready")[0] == (mode != WAITING)
+        assert (bench.mode(), bench.out("in_charge")) == (mode, in_charge)
+        assert bench.out("is_ready") == (mode != WAITING)
 
 
 def test_a_vehicle_is_held_where_its_pilot_left_it():
@@ -384,7 +375,7 @@ def test_a_fault_takes_effect_at_once(reason, inputs):
     if reason:
         np.testing.assert_array_equal(bench.out("velocity_setpoint")[:3], np.zeros(3))
     assert np.isfinite(bench.out("command")).all()
-    assert bench.out("state_is_known")[0] == (reason != status.STATE_OLD)
+    assert bench.out("state_is_known") == (reason != status.STATE_OLD)
 
 
 def test_the_most_severe_reason_is_told():
@@ -415,7 +406,7 @@ def test_a_state_that_does_not_change_is_frozen_at_any_speed_in_any_mode(speed, 
     frozen = moving([10.0, 0.0, 3.0], [speed, 0.0, 0.0])(0.0)
     bench.give(**first)
     bench.advance(0.14, measured=lambda now: frozen)
-    assert bench.out("state_is_known")[0] == 0  # Body rates need newer states than velocities.
+    assert bench.out("state_is_known") == 0  # Body rates need newer states than velocities.
     assert bench.out("mode")[0] == (status.HOLDING if first else status.FLYING)
     bench.advance(0.26, measured=lambda now: frozen)
     assert bench.mode() == FROZEN
@@ -429,7 +420,7 @@ def test_a_state_that_changes_again_is_used_again_while_landing():
     np.testing.assert_array_equal(bench.out("velocity_setpoint")[:3], [0.0, 0.0, -0.5])
     bench.advance(0.2, measured=moving([20.5, 0.0, 3.0], [0.1, 0.0, 0.0], since=2.6))
     assert bench.out("mode")[0] == status.LANDING
-    assert bench.out("state_is_known")[0] == 1
+    assert bench.out("state_is_known") == 1
     assert bench.out("velocity_setpoint")[0] < -0.5
 
 
@@ -462,7 +453,7 @@ def test_a_state_that_jumped_is_used_again_when_it_comes_back(inputs, steps):
     bench.give(**inputs)
     for duration, measured, mode in steps:
         bench.advance(duration, measured=measured)
-        assert (bench.mode(), bench.out("state_is_known")[0]) == (mode, mode == FLYING)
+        assert (bench.mode(), bench.out("state_is_known")) == (mode, mode == FLYING)
         assert mode == FLYING or not bench.out("velocity_setpoint")[:3].any()
 
 

@@ -3,7 +3,7 @@ import struct
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
+from harness import Harness
 
 from splatpilot.systems.messaging import receiver
 
@@ -38,24 +38,21 @@ def packet(value: float, seq: int, time_ns: int) -> bytes:
     return struct.pack("<IIQ144f", 0x544F4632, seq, time_ns, *[value] * 144)
 
 
-class Sensor:
+class Sensor(Harness):
     """A receiver of a sensor's stream."""
 
     def __init__(self):
         config = receiver.TimeOfFlightStream(receiver.UdpConfig(port=0), latency=0.02)
-        self.system = receiver.TimeOfFlightReceiver(config, 0.01)
-        self.simulator = Simulator(self.system)
-        self.simulator.Initialize()
+        super().__init__(receiver.TimeOfFlightReceiver(config, 0.01))
 
     def after(self, now: float, *packets: bytes) -> tuple[float, float, float, float]:
         """The value of the grid, its age, gaps and rejected packets at a time."""
         for data in packets:
             send(self.system.port, data)
         self.simulator.AdvanceTo(now)
-        context, names = self.simulator.get_context(), ("depth_grid", "age", "gaps", "rejected")
-        values = [self.system.GetOutputPort(name).Eval(context) for name in names]
-        assert values[0].shape == (144,) and np.ptp(values[0]) == 0.0
-        return tuple(float(value[0]) for value in values)
+        grid = self.out("depth_grid")
+        assert grid.shape == (144,) and np.ptp(grid) == 0.0
+        return grid[0], self.out("age"), self.out("gaps"), self.out("rejected")
 
 
 def test_grid_and_its_age():

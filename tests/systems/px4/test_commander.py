@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
-from packets import Packets
-from pydrake.systems.analysis import Simulator
+from harness import Harness, Packets
 from pymavlink.dialects.v20 import common as dialect
 
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
@@ -11,39 +10,28 @@ from splatpilot.systems.px4.mavlink import HOLD, LAND, OFFBOARD, Mavlink
 TICK, UNIX_TIME = 0.002, 1_800_000_000.0  # [s] The latter is that of time 0.
 
 
-class Told:
+class Told(Harness):
     """A commander, and the messages that it sends. A setpoint of age 0 is one of a 50 Hz stream."""
 
     def __init__(self, config: Px4CommanderConfig | None = None, **inputs):
-        self.packets = Packets()
-        self.system = Px4Commander(
-            config or Px4CommanderConfig(), self.packets, Mavlink(), ("127.0.0.1", 9), 9.81
-        )
-        self.simulator = Simulator(self.system)
-        self.give(setpoint=[1.0, 0, 0, np.nan], setpoint_age=[0.0], armed=[0.0], mode=[3.0, 0.0])
-        self.give(heartbeat_age=[0.0], granted=[0.0, 0.0], unix_time=[UNIX_TIME], **inputs)
-        self.simulator.Initialize()
-
-    @property
-    def now(self) -> float:
-        return self.simulator.get_context().get_time()
+        self.packets, config = Packets(), config or Px4CommanderConfig()
+        system = Px4Commander(config, self.packets, Mavlink(), ("127.0.0.1", 9), 9.81)
+        given = {"setpoint": [1.0, 0, 0, np.nan], "setpoint_age": 0.0, "armed": 0.0}
+        given |= {"mode": [3.0, 0.0], "heartbeat_age": 0.0, "granted": [0.0, 0.0]}
+        super().__init__(system, **given | {"unix_time": UNIX_TIME} | inputs)
 
     def give(self, **inputs) -> None:
-        context = self.simulator.get_mutable_context()
-        for name, value in inputs.items():
-            self.system.GetInputPort(name).FixValue(context, value)
+        super().give(**inputs)
         if "setpoint_age" in inputs:
-            self.sent = self.now - inputs["setpoint_age"][0]
+            self.sent = self.now - inputs["setpoint_age"]
             self.is_stream = self.sent == self.now
 
     def advance(self, duration: float) -> list:
         """Returns the messages that are sent meanwhile, without heartbeats."""
-        context = self.simulator.get_mutable_context()
         for tick in range(round(self.now / TICK), round((self.now + duration) / TICK)):
             if self.is_stream and tick % 10 == 0:
                 self.sent = tick * TICK
-            self.system.GetInputPort("setpoint_age").FixValue(context, [tick * TICK - self.sent])
-            self.system.GetInputPort("unix_time").FixValue(context, [UNIX_TIME + tick * TICK])
+            super().give(setpoint_age=tick * TICK - self.sent, unix_time=UNIX_TIME + tick * TICK)
             self.simulator.AdvanceTo((tick + 1) * TICK)
         return [each for each in self.packets.take_sent() if each.get_type() != "HEARTBEAT"]
 
@@ -51,7 +39,7 @@ class Told:
         """Returns the messages that are sent while the last heartbeat ages."""
         messages = []
         for age in np.arange(first_age, until, 0.02):
-            self.give(heartbeat_age=[age])
+            self.give(heartbeat_age=age)
             messages += self.advance(0.02)
         return messages
 
@@ -74,30 +62,30 @@ def test_setpoints_are_sent_at_50_hz_while_they_are_fresh():
     vehicle = Told()  # By default nothing else is sent, and nothing arms.
     sent = vehicle.advance(3.0)
     assert len(sent) == pytest.approx(150, abs=1) and len(setpoints(sent)) == len(sent)
-    vehicle.give(setpoint_age=[0.31])
+    vehicle.give(setpoint_age=0.31)
     assert vehicle.advance(1.0) == []
 
 
 def test_setpoints_are_sent_as_they_come():
     vehicle = Told()
     vehicle.advance(0.105)
-    vehicle.give(setpoint_age=[0.012])
+    vehicle.give(setpoint_age=0.012)
     assert vehicle.advance(0.002) == []
-    vehicle.give(setpoint=[0.0, 2.0, 0, np.nan], setpoint_age=[0.001])
+    vehicle.give(setpoint=[0.0, 2.0, 0, np.nan], setpoint_age=0.001)
     sent = vehicle.advance(0.006)
     assert [(m.vx, m.vy) for m in sent] == [(0.0, -2.0)]
-    vehicle.give(setpoint_age=[0.5])
+    vehicle.give(setpoint_age=0.5)
     vehicle.advance(0.02)
-    vehicle.give(setpoint_age=[0.4])
+    vehicle.give(setpoint_age=0.4)
     assert vehicle.advance(0.05) == []
 
 
 @pytest.mark.parametrize("mode", [status.WAITING, status.HOLDING, status.LANDING])
 def test_offboard_mode_is_requested_only_while_the_bridge_flies(mode):
     config = Px4CommanderConfig(engage=True, arm=True)
-    vehicle = Told(config, bridge_mode=[float(mode)])
+    vehicle = Told(config, bridge_mode=float(mode))
     assert modes(vehicle.advance(4.0)) == []
-    vehicle.give(bridge_mode=[float(status.FLYING)])
+    vehicle.give(bridge_mode=float(status.FLYING))
     asked = modes(vehicle.advance(2.5))
     assert len(asked) == 3 and set(asked) == {OFFBOARD}
 
@@ -107,13 +95,13 @@ def test_arming_is_requested_only_in_offboard_mode():
     vehicle.advance(2.0)
     vehicle.give(mode=[6.0, 0.0])
     assert requests(vehicle.advance(2.0)) == [dialect.MAV_CMD_COMPONENT_ARM_DISARM] * 2
-    vehicle.give(armed=[1.0])
+    vehicle.give(armed=1.0)
     assert requests(vehicle.advance(3.0)) == []
 
 
-FLYING = {"bridge_mode": [float(status.FLYING)], "mode": [6.0, 0.0], "armed": [1.0]}
-LOST = {"setpoint_age": [0.31]}
-LANDS = {"bridge_mode": [float(status.LANDING)]}
+FLYING = {"bridge_mode": float(status.FLYING), "mode": [6.0, 0.0], "armed": 1.0}
+LOST = {"setpoint_age": 0.31}
+LANDS = {"bridge_mode": float(status.LANDING)}
 
 
 @pytest.mark.parametrize(("loss", "mode"), [(LOST, HOLD), (LANDS, LAND)])
@@ -123,11 +111,10 @@ def test_a_mode_is_requested_after_a_heartbeat_that_is_newer_than_the_loss(loss,
     vehicle.give(**loss)
     for silence in (0.9, 1.5):
         assert modes(vehicle.advance_without_heartbeats(0.02, silence)) == []
-        vehicle.give(heartbeat_age=[0.0])
+        vehicle.give(heartbeat_age=0.0)
         assert modes(vehicle.advance(0.04)) == [mode]
-    context = vehicle.simulator.get_context()
-    assert vehicle.system.GetOutputPort("ended").Eval(context) == 1.0
-    vehicle.give(mode=list(mode), bridge_mode=[float(status.FLYING)], setpoint_age=[0.0])
+    assert vehicle.out("ended") == 1.0
+    vehicle.give(mode=list(mode), bridge_mode=float(status.FLYING), setpoint_age=0.0)
     assert vehicle.advance(3.0) == []
 
 
@@ -135,7 +122,7 @@ def test_a_mode_is_requested_after_a_heartbeat_that_is_newer_than_the_loss(loss,
 def test_until_then_the_vehicle_is_told_to_stop(interface, age):
     vehicle = Told(Px4CommanderConfig(setpoints=interface), **FLYING)
     vehicle.advance(1.0)
-    vehicle.give(setpoint_age=[age])
+    vehicle.give(setpoint_age=age)
     sent = vehicle.advance_without_heartbeats(0.02, 3.0)
     assert set(setpoints(sent)) == {(0.0, 0.0, 0.0)}
     assert len(sent) == pytest.approx(100, abs=2)
@@ -144,11 +131,11 @@ def test_until_then_the_vehicle_is_told_to_stop(interface, age):
 def test_a_bridge_that_comes_back_in_time_flies_on():
     vehicle = Told(**FLYING)
     vehicle.advance(1.0)
-    vehicle.give(heartbeat_age=[0.5], **LOST)
+    vehicle.give(heartbeat_age=0.5, **LOST)
     vehicle.advance(0.1)
-    vehicle.give(setpoint_age=[0.0])
+    vehicle.give(setpoint_age=0.0)
     vehicle.advance(0.02)
-    vehicle.give(heartbeat_age=[0.0])
+    vehicle.give(heartbeat_age=0.0)
     sent = vehicle.advance(1.0)
     assert modes(sent) == [] and set(setpoints(sent)) == {(1.0, 0.0, 0.0)}
 
@@ -157,7 +144,7 @@ def test_a_bridge_that_comes_back_in_time_flies_on():
 def test_without_heartbeats_nothing_is_requested(loss):
     vehicle = Told(Px4CommanderConfig(engage=True, arm=True), **FLYING)
     vehicle.advance(2.0)
-    vehicle.give(heartbeat_age=[3.1], mode=[0.0, 0.0], armed=[0.0], **loss)
+    vehicle.give(heartbeat_age=3.1, mode=[0.0, 0.0], armed=0.0, **loss)
     sent = vehicle.advance(3.0)
     assert requests(sent) == []
     assert len(setpoints(sent)) >= 100
@@ -175,13 +162,13 @@ def test_a_granted_request_is_not_repeated(mode, granted, command):
 
 @pytest.mark.parametrize(("interval", "sent"), [(0.005, 50), (1 / 120, 40), (0.02, 50), (0.1, 10)])
 def test_poses_are_sent_once_as_they_come_at_50_hz_at_most(interval, sent):
-    vehicle = Told(motion_capture_age=[0.31], motion_capture_pose=[1.0, 2, 3, 1, 0, 0, 0])
+    vehicle = Told(motion_capture_age=0.31, motion_capture_pose=[1.0, 2, 3, 1, 0, 0, 0])
     assert "ODOMETRY" not in [m.get_type() for m in vehicle.advance(0.1)]  # It is too old.
     messages, start = [], vehicle.now
     for tick in range(500):
         now, seen = 0.002 * tick, interval * np.floor(0.002 * tick / interval + 1e-6)
         vehicle.give(motion_capture_pose=[seen, 2, 3, 1, 0, 0, 0])
-        vehicle.give(motion_capture_age=[now - seen + 0.01])
+        vehicle.give(motion_capture_age=now - seen + 0.01)
         messages += vehicle.advance(0.002)
     poses = [m for m in messages if m.get_type() == "ODOMETRY"]
     assert len(poses) == pytest.approx(sent, abs=1)

@@ -3,8 +3,7 @@ import struct
 
 import numpy as np
 import pytest
-from natnet_frame import natnet_frame
-from pydrake.systems.analysis import Simulator
+from harness import Harness, natnet_frame
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.messaging.receiver import UdpConfig
@@ -13,21 +12,14 @@ from splatpilot.systems.px4.motion_capture import MotionCaptureConfig, MotionCap
 LATENCY = 0.02
 
 
-class Stream:
+class Stream(Harness):
     """A receiver, and the cameras that send to it."""
 
     def __init__(self, now=None, group: str = ""):
         udp = UdpConfig(port=0, group=group)
         config = MotionCaptureConfig(udp, body_id=3, version=[4, 0], latency=LATENCY)
-        self.system = MotionCaptureReceiver(config, 0.01, now)
-        self.simulator = Simulator(self.system)
+        super().__init__(MotionCaptureReceiver(config, 0.01, now), unix_time=0.0)
         self.to, self.number = group or "127.0.0.1", 0
-        self._tell_time()
-        self.simulator.Initialize()
-
-    def _tell_time(self) -> None:
-        context = self.simulator.get_mutable_context()
-        self.system.GetInputPort("unix_time").FixValue(context, [context.get_time()])
 
     def see(self, body=3, position=(1.0, 2.0, 3.0), q=(0, 0, 0, 1), tracked=True, number=None):
         self.number = self.number + 1 if number is None else number
@@ -40,13 +32,10 @@ class Stream:
             out.sendto(data, (self.to, self.system.port))
 
     def after(self, duration: float) -> tuple[np.ndarray, float, float]:
-        context = self.simulator.get_mutable_context()
         for _ in range(round(duration / 0.01)):
-            self.simulator.AdvanceTo(context.get_time() + 0.01)
-            self._tell_time()
-        names = "motion_capture_pose", "age", "rejected"
-        pose, age, rejected = (self.system.GetOutputPort(n).Eval(context).copy() for n in names)
-        return pose, age[0], rejected[0]
+            self.simulator.AdvanceTo(self.now + 0.01)
+            self.give(unix_time=self.now)
+        return self.out("motion_capture_pose"), self.out("age"), self.out("rejected")
 
 
 def test_pose_is_that_of_the_body_in_our_frames():

@@ -2,8 +2,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from packets import Packets
-from pydrake.systems.analysis import Simulator
+from harness import Harness, Packets
 from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
@@ -23,28 +22,18 @@ def attitude(time: float, yaw: float = 0.0, rate: float = 0.0):
     return dialect.MAVLink_attitude_quaternion_message(round(1e3 * time), *q, 0.1, 0.2, rate)
 
 
-class Link:
+class Link(Harness):
     """Telemetry, and PX4's end of it."""
 
     def __init__(self, now: Callable[[], float] | None = None):
         self.packets, self.mavlink = Packets(), dialect.MAVLink(None, 1, 1)
-        self.system = Px4Telemetry(self.packets, Mavlink(), ("127.0.0.1", 9), 0.01, now)
-        self.simulator = Simulator(self.system)
-        self.tell_time()
-        self.simulator.Initialize()
-
-    @property
-    def now(self) -> float:
-        return self.simulator.get_context().get_time()
+        system = Px4Telemetry(self.packets, Mavlink(), ("127.0.0.1", 9), 0.01, now)
+        super().__init__(system, unix_time=EPOCH)
 
     @property
     def boot_time(self) -> float:
         """[s] By PX4's clock."""
         return EPOCH + self.now - BOOT
-
-    def tell_time(self) -> None:
-        context = self.simulator.get_mutable_context()
-        self.system.GetInputPort("unix_time").FixValue(context, [EPOCH + context.get_time()])
 
     def send(self, *messages, raw: bytes = b"") -> None:
         """Sends messages in one packet."""
@@ -60,12 +49,8 @@ class Link:
         """The TIMESYNC messages that are sent meanwhile."""
         for _ in range(round(duration / 0.01)):
             self.simulator.AdvanceTo(round(self.now + 0.01, 6))
-            self.tell_time()
+            self.give(unix_time=EPOCH + self.now)
         return self.packets.take_sent()
-
-    def out(self, name: str):
-        value = self.system.GetOutputPort(name).Eval(self.simulator.get_context()).copy()
-        return value if len(value) > 1 else value[0]
 
 
 @pytest.fixture
