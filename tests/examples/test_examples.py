@@ -90,7 +90,7 @@ def test_lqr_hover(run):
 
 
 def test_train_ppo(run):
-    sizes = ("--envs", 4, "--worlds", 1, "--tests", 2, "--minutes", 0.01)
+    sizes = ("--envs", 4, "--worlds", 1, "--tests", 1, "--minutes", 1e-4)
     for observation in (("state", "goal", "obstacle"), ("depth", "state", "goal")):
         out = run("train_ppo.py", "--observation", *observation, *sizes)
         assert number(r"(\d+) steps", out) == 256
