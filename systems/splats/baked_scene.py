@@ -306,8 +306,7 @@ def _render_views(
         )
         cameras.append(camera)
     # Environments follow.
-    skies = [isinstance(background, EnvironmentMap) for background in backgrounds]
-    colors = [BLACK if sky else color for color, sky in zip(backgrounds, skies, strict=True)]
+    colors = [BLACK if isinstance(each, EnvironmentMap) else each for each in backgrounds]
     for color in colors:
         valid = len(color) == 3 and np.isfinite(color).all()
         require(valid, "background", "3 finite numbers", list(color))
@@ -318,14 +317,15 @@ def _render_views(
     drawn = {name: image if name in names else None for name, image in images.items()}
     draw(cameras, np.array(colors, np.float32).reshape(-1, 3), drawn)
     view = RenderedView(images["color"], images["depth"][..., 0], images["alpha"][..., 0])
-    if distortion is None and not any(skies):
+    has_sky = any(isinstance(each, EnvironmentMap) for each in backgrounds)
+    if distortion is None and not has_sky:
         return view
     slopes = pixel_slopes(distortion, K, width, height)[first:last]
     hidden = np.isnan(slopes[..., 0])
     for name in names:
         images[name][..., hidden, :] = 0.0
     for i, background in enumerate(backgrounds):
-        if skies[i] and view.color.size:
+        if isinstance(background, EnvironmentMap) and view.color.size:
             part = RenderedView(*(image[i] for image in view)) if shape else view
             part.color[:] = put_behind(part, background, slopes, X_WCs[i]).color
     return view

@@ -38,7 +38,8 @@ def named_tensors(*tensors: Tensor | None, sh_degree: int | None) -> dict[str, T
     N, C = (given[n].shape[0] if given[n].ndim else 0 for n in ("means", "viewmats"))
     color = (3,) if sh_degree is None else ("K", 3)
     gaussians: list[tuple[int | str, ...]] = [(N, 3), (N, 4), (N, 3), (N,), (N, *color)]
-    shapes = dict(zip(TENSORS, [*gaussians, (C, 4, 4), (C, 3, 3), (C, 3)], strict=True))
+    sizes = [*gaussians, (C, 4, 4), (C, 3, 3), (C, 3)]
+    shapes = {name: size for name, size in zip(TENSORS, sizes, strict=True)}
     device = given["means"].device
     for name, tensor in given.items():
         allowed = [shapes[name], *([(C, *shapes[name])] if name == "colors" else [])]

@@ -53,7 +53,6 @@ from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import (
     color_pixels,
     empty_scene,
-    label_body,
     ranged_depth,
     surface_labels,
 )
@@ -292,13 +291,13 @@ class SplatRenderEngine(RenderEngine):
     def DoRenderLabelImage(self, camera: ColorRenderCamera, label_image_out: ImageLabel16I) -> None:
         view = self._view(camera.core())
         shapes = np.asarray(self._shapes().RenderLabelImage(*self._same(camera)).data)[..., 0]
-        splats = surface_labels(view.depth)
+        arguments, bodies = self._camera(camera.core())[0], []
         for id, (_, properties) in self._bodies.items():
             if properties.HasProperty("label", "id"):
                 label = int(cast(RenderLabel, properties.GetProperty("label", "id")))
-                alone, _ = self._camera(camera.core())
-                depth = empty_scene().render_depth(*alone, moving=self._placed([id]))
-                label_body(splats, view.depth, depth, label)
+                alone = empty_scene().render_depth(*arguments, moving=self._placed([id]))
+                bodies.append((label, alone))
+        splats = surface_labels(view.depth, bodies)
         empty = int(RenderLabel.kEmpty)
         shape_seen = (self._shape_depth(camera.core()) <= view.depth) | (splats == empty)
         labels = np.where(shape_seen & (shapes != empty), shapes, splats)

@@ -1,7 +1,7 @@
 """Cameras in Gaussian scenes."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -52,24 +52,19 @@ def ranged_depth(
     return np.where(in_range, np.where(depth < min_depth, np.float32(0), depth), np.inf)
 
 
-def surface_labels(depth: NDArray[np.float32]) -> NDArray[np.int16]:
-    """Labels pixels (H, W) with a surface `kUnspecified` and others, of depth 0, `kEmpty`."""
-    unspecified, empty = int(RenderLabel.kUnspecified), int(RenderLabel.kEmpty)
-    return np.where(depth > 0, unspecified, empty).astype(np.int16)
-
-
 _LABEL_TOLERANCE = 0.02  # [m] between the surface in a pixel and that of its body
 
 
-def label_body(
-    labels: NDArray[np.int16],
-    depth: NDArray[np.float32],
-    body_depth: NDArray[np.float32],
-    label: int,
-) -> None:
-    """Labels pixels (H, W) whose depth [m] is that of a body alone, 0 without its surface."""
-    shown = (body_depth > 0) & (np.abs(body_depth - depth) < _LABEL_TOLERANCE)
-    labels[shown] = label
+def surface_labels(
+    depth: NDArray[np.float32], bodies: Iterable[tuple[int, NDArray[np.float32]]]
+) -> NDArray[np.int16]:
+    """Labels pixels (H, W) of depths [m], 0 without a surface, by the labels of bodies and their
+    depths alone; other surfaces are `kUnspecified`, and the rest `kEmpty`."""
+    unspecified, empty = int(RenderLabel.kUnspecified), int(RenderLabel.kEmpty)
+    labels = np.where(depth > 0, unspecified, empty).astype(np.int16)
+    for label, alone in bodies:
+        labels[(alone > 0) & (np.abs(alone - depth) < _LABEL_TOLERANCE)] = label
+    return labels
 
 
 @cache
@@ -430,12 +425,11 @@ class SplatCamera(LeafSystem):
         value.get_mutable_value().mutable_data[..., 0] = np.minimum(depth * 1000.0 + 0.5, 65535.0)
 
     def _calc_label(self, context, value) -> None:
-        depth, camera = self._depth(context), self._camera_state(context)
-        labels = surface_labels(depth)
+        camera = self._camera_state(context)
         bodies = camera.bodies or Bodies(0.0)
-        for label, track in enumerate(bodies.tracks):
-            alone = camera._replace(bodies=replace(bodies, obstacles=None, tracks=(track,)))
-            label_body(labels, depth, self._render_depth(empty_scene(), alone), label)
+        alone = (replace(bodies, obstacles=None, tracks=(track,)) for track in bodies.tracks)
+        depths = (self._render_depth(empty_scene(), camera._replace(bodies=b)) for b in alone)
+        labels = surface_labels(self._depth(context), enumerate(depths))
         value.get_mutable_value().mutable_data[..., 0] = labels
 
     def _calc_body_pose(self, context, value) -> None:

@@ -104,9 +104,9 @@ def draw_distance_slice(meshcat: Meshcat, path: str, field: DistanceField, heigh
     lower, upper = np.asarray(field.lower_W)[:2], np.asarray(field.upper_W)[:2]
     margin, spacing = 1e-3 * (upper - lower), math.sqrt(np.prod(upper - lower) / _SLICE_POINTS)
     nx, ny = np.maximum(2, np.ceil((upper - lower) / max(0.2, spacing)).astype(int))
-    ends = np.transpose([lower + margin, upper - margin])
-    axes = [np.linspace(*pair, count) for pair, count in zip(ends, (nx, ny), strict=True)]
-    p_WQ = np.stack(np.meshgrid(*axes, [height], indexing="ij"), axis=-1).reshape(-1, 3)
+    first, last = lower + margin, upper - margin
+    x, y = (np.linspace(first[k], last[k], count) for k, count in enumerate((nx, ny)))
+    p_WQ = np.stack(np.meshgrid(x, y, [height], indexing="ij"), axis=-1).reshape(-1, 3)
     sample = field.query(p_WQ)
     colors = distance_colors(np.nan_to_num(sample.distance) / 2.0)
     colors[sample.state >= FieldState.UNKNOWN] = UNKNOWN_GRAY

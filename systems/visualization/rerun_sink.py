@@ -183,7 +183,7 @@ class RerunSink(LeafSystem):
     def _publish(self, context: Context) -> EventStatus:
         if self._recording is None:
             self._begin(context)
-        self._recording.set_time("time", duration=context.get_time())
+        cast(Any, self._recording).set_time("time", duration=context.get_time())
         for k in range(self.num_input_ports()):
             port = self.get_input_port(k)
             self._log[port.get_name()](port.Eval(context))
