@@ -2,8 +2,8 @@ import math
 
 import numpy as np
 import pytest
+from harness import Harness
 from pydrake.common.value import Value
-from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 
 from splatpilot.systems.messaging.arrival_triggered import ArrivalTriggered
@@ -43,17 +43,13 @@ class Policy(LeafSystem):
 
 def decisions(times: np.ndarray, until: float) -> np.ndarray:
     """Time and image of each decision (n, 2), by images that come 0.01 s after their times."""
-    triggered = ArrivalTriggered(Policy(), TICK)
-    simulator, rows = Simulator(triggered), [np.zeros(3)]
-    context = simulator.get_mutable_context()
+    triggered, rows = Harness(ArrivalTriggered(Policy(), TICK)), [np.zeros(3)]
     for k in range(round(until / TICK)):
         last = int((times + 0.01 <= k * TICK + 1e-9).sum()) - 1
         age = math.inf if last < 0 else k * TICK - times[last]
-        triggered.GetInputPort("image").FixValue(context, [last])
-        triggered.GetInputPort("observation_age").FixValue(context, [age])
-        simulator.AdvanceTo((k + 0.5) * TICK)
-        ports = "decided", "seen", "count"
-        rows.append([triggered.GetOutputPort(port).Eval(context)[0] for port in ports])
+        triggered.give(image=last, observation_age=age)
+        triggered.simulator.AdvanceTo((k + 0.5) * TICK)
+        rows.append([triggered.out(port) for port in ("decided", "seen", "count")])
     rows = np.array(rows)
     return rows[1:][np.diff(rows[:, 2]) > 0, :2]
 
@@ -93,14 +89,14 @@ def test_without_images_it_continues():
 
 
 def test_outputs_are_the_systems():
-    triggered = ArrivalTriggered(Policy(), TICK)
-    context = triggered.CreateDefaultContext()
-    context.SetDiscreteState(0, [3.0])
-    assert triggered.GetOutputPort("double").Eval(context)[0] == 6.0
+    system = ArrivalTriggered(Policy(), TICK)
+    triggered = Harness(system)
+    triggered.context.SetDiscreteState(0, [3.0])
+    assert triggered.out("double") == 6.0
     for image in (4.0, 5.0):
-        triggered.GetInputPort("image").FixValue(context, [image])
-        assert triggered.GetOutputPort("sum").Eval(context)[0] == 3.0 + image
-    assert triggered.HasDirectFeedthrough(0, 3) and not triggered.HasDirectFeedthrough(0, 2)
+        triggered.give(image=image)
+        assert triggered.out("sum") == 3.0 + image
+    assert system.HasDirectFeedthrough(0, 3) and not system.HasDirectFeedthrough(0, 2)
 
 
 @pytest.mark.parametrize(
@@ -108,16 +104,12 @@ def test_outputs_are_the_systems():
 )
 def test_an_exception_of_the_system_is_told_and_logged_once(caplog, broken, said):
     policy = Policy()
-    triggered = ArrivalTriggered(policy, TICK)
-    simulator = Simulator(triggered)
-    context = simulator.get_mutable_context()
-    triggered.GetInputPort("observation_age").FixValue(context, [0.0])
+    triggered = Harness(ArrivalTriggered(policy, TICK), observation_age=0.0)
 
     def after(now: float, image: float) -> list[float]:
-        triggered.GetInputPort("image").FixValue(context, [image])
-        simulator.AdvanceTo(now)
-        ports = "failed", "seen", "double"
-        return [triggered.GetOutputPort(port).Eval(context)[0] for port in ports]
+        triggered.give(image=image)
+        triggered.simulator.AdvanceTo(now)
+        return [triggered.out(port) for port in ("failed", "seen", "double")]
 
     assert after(0.3, 3.0) == [0.0, 3.0, 6.0]
     policy.broken = broken

@@ -8,7 +8,7 @@ import lcm
 import numpy as np
 import pytest
 from drake import lcmt_header
-from pydrake.systems.analysis import Simulator
+from harness import Harness
 from pydrake.systems.framework import DiagramBuilder
 
 from splatpilot.systems.messaging import lcm_ports
@@ -53,14 +53,11 @@ def test_too_many_open_files_are_an_error_and_no_crash():
 def published(publisher, until: float, inputs) -> list:
     """Messages, and their times, of a publisher of commands whose inputs depend on time [s]."""
     transport, heard = lcm.LCM("memq://"), []
-    system = publisher(transport, CommandCodec())
-    simulator = Simulator(system)
-    context, decode = simulator.get_mutable_context(), CommandCodec.message.decode
-    transport.subscribe(CHANNEL, lambda _, data: heard.append((decode(data), context.get_time())))
+    system, decode = Harness(publisher(transport, CommandCodec())), CommandCodec.message.decode
+    transport.subscribe(CHANNEL, lambda _, data: heard.append((decode(data), system.now)))
     for now in 0.001 * np.arange(round(1000 * until) + 1):
-        for name, value in {"unix_time": EPOCH + now, **inputs(now)}.items():
-            system.GetInputPort(name).FixValue(context, np.atleast_1d(value))
-        simulator.AdvanceTo(now + 2.0 * lcm_ports.PUBLISH_OFFSET)
+        system.give(unix_time=EPOCH + now, **inputs(now))
+        system.simulator.AdvanceTo(now + 2.0 * lcm_ports.PUBLISH_OFFSET)
         while transport.handle_timeout(0):
             pass
     return heard
@@ -108,19 +105,19 @@ def test_measurements_are_sent_once_as_they_come_with_their_own_time():
     np.testing.assert_allclose([when for _, when in heard], [0.15, 0.16, 0.25, 0.35], atol=0.0011)
 
 
-class Listener:
+class Listener(Harness):
     """A subscriber of commands in a diagram of its own, whose time the test advances."""
 
     def __init__(self):
-        self.lcm = lcm.LCM("memq://")
-        builder = DiagramBuilder()
+        self.lcm, builder = lcm.LCM("memq://"), DiagramBuilder()
         self.clock = builder.AddSystem(UnixClock())
         subscriber = lcm_ports.MessageSubscriber(self.lcm, CommandCodec(), 0.01)
-        self.subscriber = builder.AddSystem(subscriber)
-        builder.Connect(self.clock.get_output_port(), self.subscriber.get_input_port())
-        self.simulator = Simulator(builder.Build())
-        self.root = self.simulator.get_mutable_context()
-        self.clock.set_epoch(self.root, EPOCH)
+        builder.AddSystem(subscriber)
+        builder.Connect(self.clock.get_output_port(), subscriber.get_input_port())
+        for name in ("command", "age", "gaps", "rejected"):
+            builder.ExportOutput(subscriber.GetOutputPort(name), name)
+        super().__init__(builder.Build())
+        self.clock.set_epoch(self.context, EPOCH)
 
     def advance_to(self, time: float, *messages: bytes) -> None:
         """Sends messages, and advances to just after the updates at `time` [s]."""
@@ -128,17 +125,13 @@ class Listener:
             self.lcm.publish(CHANNEL, data)
         self.simulator.AdvanceTo(time + 1e-6)
 
-    def output(self, port: str):
-        context = self.subscriber.GetMyContextFromRoot(self.root)
-        return self.subscriber.GetOutputPort(port).Eval(context)
-
     @property
     def value(self):
-        return self.output("command")
+        return self.out("command")
 
     @property
     def counts(self) -> tuple[float, float]:
-        return self.output("gaps")[0], self.output("rejected")[0]
+        return self.out("gaps"), self.out("rejected")
 
 
 def message(
@@ -156,11 +149,11 @@ def test_last_message_and_its_age():
     listener = Listener()
     listener.advance_to(0.5)
     assert np.isnan(listener.value).all()
-    assert listener.output("age")[0] == np.inf
+    assert listener.out("age") == np.inf
     listener.advance_to(0.6, message(0, 0.485, thrust=8.0), message(1, 0.595))
     np.testing.assert_array_equal(listener.value, [9.0, 0.1, 0.2, 0.3])
     listener.advance_to(0.9)
-    assert listener.output("age")[0] == pytest.approx(0.305001, abs=1e-6)
+    assert listener.out("age") == pytest.approx(0.305001, abs=1e-6)
     assert listener.counts == (0, 0)
 
 
@@ -232,9 +225,9 @@ def test_a_log_is_lcms_and_replays(tmp_path):
     listeners = Listener(), Listener()
     for ours in listeners:
         lcm_ports.replay(path, ours.lcm, ours.simulator, ours.clock)
-        ours.advance_to(ours.root.get_time() + 0.01)
+        ours.advance_to(ours.now + 0.01)
         assert (ours.value[0], ours.counts) == (5.0, (1, 0))
-    assert listeners[0].output("age")[0] == listeners[1].output("age")[0]
+    assert listeners[0].out("age") == listeners[1].out("age")
 
 
 def test_a_full_disk_only_ends_the_log(caplog):
@@ -261,19 +254,15 @@ def test_invalid_logs_are_errors(tmp_path):
 @pytest.mark.parametrize(
     ("images", "overruns", "status"),
     [
-        (["depth_image_32f", "color_image"], None, [2, 4, 0.01, 0.07, 6, 12, 0]),
-        ([], 4.0, [2, 4, 0.01, 0, 2, 5, 4]),
+        (["depth_image_32f", "color_image"], {}, [2, 4, 0.01, 0.07, 6, 12, 0]),
+        ([], {"overruns": 4.0}, [2, 4, 0.01, 0, 2, 5, 4]),
     ],
 )
 def test_status_sums_up_the_inputs(images, overruns, status):
-    system = BridgeStatus(images)
-    context = system.CreateDefaultContext()
+    system = Harness(BridgeStatus(images), mode=[2.0, 4.0], **overruns)
     values = {"age": (0.01, 0.05, 0.07), "gaps": (2.0, 3.0, 1.0), "rejected": (5.0, 7.0, 0.0)}
     for what, numbers in values.items():
         for name, value in zip(["state", *images], numbers, strict=False):
-            system.GetInputPort(f"{name}_{what}").FixValue(context, [value])
-    system.GetInputPort("mode").FixValue(context, [2.0, 4.0])
-    if overruns is not None:
-        system.GetInputPort("overruns").FixValue(context, [overruns])
-    np.testing.assert_array_equal(system.GetOutputPort("status").Eval(context), status)
-    assert system.GetOutputPort("observation_age").Eval(context)[0] == status[3]
+            system.give(**{f"{name}_{what}": value})
+    np.testing.assert_array_equal(system.out("status"), status)
+    assert system.out("observation_age") == status[3]
