@@ -2,8 +2,6 @@ import numpy as np
 import pytest
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import Linearize
 
 from splatpilot.systems.collision.distance_field import FieldState, soft_barrier
 from splatpilot.systems.collision.esdf_collision import (
@@ -12,7 +10,7 @@ from splatpilot.systems.collision.esdf_collision import (
     EsdfCollision,
 )
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Sphere
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant, hover_state
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 SIZES = {"distance": 1, "gradient": 3, "clearance": 1}
 SIZES |= {"in_collision": 1, "barrier": 1, "field_state": 1}
@@ -106,20 +104,6 @@ def test_outputs_have_exact_derivatives():
     system.get_input_port().FixValue(context, ExtractValue(state).ravel())
     system.SetMargin(context, AutoDiffXd(1.0, [1.0]))
     assert gradient("barrier") == pytest.approx(-SLOPE)
-
-
-def test_a_diagram_of_plant_and_collision_is_linearized():
-    builder = DiagramBuilder()
-    plant = builder.AddSystem(QuadrotorPlant())
-    collision = builder.AddSystem(EsdfCollision(FIELD))
-    builder.Connect(plant.get_output_port(), collision.get_input_port())
-    builder.ExportInput(plant.get_input_port())
-    builder.ExportOutput(collision.GetOutputPort("barrier"))
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    context.SetContinuousState(hover_state([0.0, 0.0, 2.5]))
-    diagram.get_input_port().FixValue(context, [9.81, 0.0, 0.0, 0.0])
-    np.testing.assert_allclose(Linearize(diagram, context).C(), [[0, 0, SLOPE, *np.zeros(10)]])
 
 
 def test_the_closest_point_with_clearance_is_found():
