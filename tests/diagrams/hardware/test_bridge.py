@@ -12,6 +12,7 @@ import lcm
 import numpy as np
 import pytest
 from halves import TICK, Halves
+from harness import Harness
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
@@ -287,10 +288,10 @@ class Watched:
         self.simulator = Simulator(self.diagram)
         root = self.simulator.get_context()
         self.flight = bridge.BridgeFlight(self.diagram, root, scenario, world.p_WG, config)
-        self.senders = {}
-        for codec in (StateCodec(), VehicleStatusCodec()):
-            sender = MessagePublisher(self.lcm, codec, 0.02)
-            self.senders[codec.port] = sender, sender.CreateDefaultContext()
+        self.senders = {
+            codec.port: Harness(MessagePublisher(self.lcm, codec, 0.02))
+            for codec in (StateCodec(), VehicleStatusCodec())
+        }
         self.tick, self.over = 0, False
 
     def hear(self, duration: float, charge, p_WB=None) -> None:
@@ -300,12 +301,11 @@ class Watched:
             noise = 1e-4 * np.sin(now)  # An estimate is never the same for long.
             state = hover_state(np.array(p_WB or [0, 0, 0]) + noise)
             for port, value in (("vehicle_status", charge), ("state", state)):
-                sender, context = self.senders[port]
-                context.SetTime(now)
-                sender.GetInputPort(port).FixValue(context, value)
-                sender.GetInputPort("unix_time").FixValue(context, [now])
+                sender = self.senders[port]
+                sender.context.SetTime(now)
+                sender.give(**{port: value}, unix_time=now)
                 if port != "state" or p_WB is not None:
-                    sender.ForcedPublish(context)
+                    sender.system.ForcedPublish(sender.context)
             self.simulator.AdvanceTo(now + 1e-3)
             self.over = self.over or self.flight.is_over(now)
             self.tick += 1

@@ -18,23 +18,15 @@ BOOT = -123.4  # [s], when it began.
 
 
 class Px4StandIn:
-    """
-    Args:
-        version: "1.16" or "1.18", whose rules of offboard mode are enforced.
-        p_WB: (3,) [m] where the vehicle is, in flight.
-        loss_timeout: [s] COM_OF_LOSS_T.
-    """
+    """A vehicle at p_WB (3,) [m] in flight, with the rules of offboard mode of "1.16" or "1.18"."""
 
-    def __init__(self, version: str, p_WB, loss_timeout: float = 1.0):
+    def __init__(self, version: str, p_WB):
         self.streamed_before = {"1.16": 1.0, "1.18": 0.0}[version]
-        self.loss_timeout = loss_timeout
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
         self.socket.setblocking(False)
-        self.port = self.socket.getsockname()[1]
-        self.peer = None
-        self.link = dialect.MAVLink(None, 1, 1)
-        self.parser = dialect.MAVLink(None)
+        self.port, self.peer = self.socket.getsockname()[1], None
+        self.link, self.parser = dialect.MAVLink(None, 1, 1), dialect.MAVLink(None)
         self.state = hover_state(p_WB)
         self.armed, self.mode = False, POSITION
         self.velocity, self.heading, self.rates = np.zeros(3), np.nan, None
@@ -67,20 +59,16 @@ class Px4StandIn:
         kind = message.get_type()
         if kind == "SET_POSITION_TARGET_LOCAL_NED":
             frames = dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_BODY_NED
-            if message.coordinate_frame not in frames or message.type_mask not in (1479, 2503):
-                self.refused.append(message)
-                return
-            self._streamed(now)
-            ned = np.array([message.vx, message.vy, message.vz])
-            self.velocity, self.rates = HALF_TURN.apply(ned), None
-            self.heading = -message.yaw if message.type_mask == 2503 else np.nan
+            valid = message.coordinate_frame in frames and message.type_mask in (1479, 2503)
+            if self._streamed(message, now, valid):
+                ned = np.array([message.vx, message.vy, message.vz])
+                self.velocity, self.rates = HALF_TURN.apply(ned), None
+                self.heading = -message.yaw if message.type_mask == 2503 else np.nan
         elif kind == "SET_ATTITUDE_TARGET":
-            if message.type_mask != 128 or not 0.0 <= message.thrust <= 1.0:
-                self.refused.append(message)
-                return
-            self._streamed(now)
-            frd = [message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate]
-            self.rates = np.append(message.thrust / 0.5 * GRAVITY, HALF_TURN.apply(frd))
+            valid = message.type_mask == 128 and 0.0 <= message.thrust <= 1.0
+            if self._streamed(message, now, valid):
+                frd = [message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate]
+                self.rates = np.append(message.thrust / 0.5 * GRAVITY, HALF_TURN.apply(frd))
         elif kind == "ODOMETRY" and message.estimator_type <= dialect.MAV_ESTIMATOR_TYPE_VIO:
             self.odometry.append(message)
         elif kind == "TIMESYNC" and message.tc1 == 0:
@@ -93,55 +81,54 @@ class Px4StandIn:
             self.answers.append((message.command, accepted))
             self._send(dialect.MAVLink_command_ack_message(message.command, result))
 
-    def _streamed(self, now: float) -> None:
+    def _streamed(self, message, now: float, valid: bool) -> bool:
+        if not valid:
+            self.refused.append(message)
+            return False
         if now - self.last_setpoint > 0.5:
             self.stream_began = now
         self.last_setpoint = now
-
-    def _may_fly_offboard(self, now: float) -> bool:
-        flows = now - self.last_setpoint <= 0.5
-        return flows and now - self.stream_began >= self.streamed_before
+        return True
 
     def _command(self, message, now: float) -> bool:
+        flows = now - self.last_setpoint <= 0.5
+        may_fly_offboard = flows and now - self.stream_began >= self.streamed_before
+        armed, mode = self.armed, self.mode
         if message.command == dialect.MAV_CMD_COMPONENT_ARM_DISARM:
-            if message.param1 and self.mode == OFFBOARD and not self._may_fly_offboard(now):
-                return False
-            self.armed = bool(message.param1)
-            return True
-        if message.command == dialect.MAV_CMD_DO_SET_MODE:
+            armed = bool(message.param1)
+            accepted = not (armed and mode == OFFBOARD) or may_fly_offboard
+        else:
             mode = int(message.param2), int(message.param3)
-            if mode == OFFBOARD and not self._may_fly_offboard(now):
-                return False
-            self.mode = mode
-            return True
-        return False
+            is_mode = message.command == dialect.MAV_CMD_DO_SET_MODE
+            accepted = is_mode and (mode != OFFBOARD or may_fly_offboard)
+        if accepted:
+            self.armed, self.mode = armed, mode
+        return accepted
 
     def _fly(self, now: float) -> None:
-        if self.mode == OFFBOARD and now - self.last_setpoint > self.loss_timeout:
+        if self.mode == OFFBOARD and now - self.last_setpoint > 1.0:  # COM_OF_LOSS_T
             self.mode = LOITER  # COM_OBL_RC_ACT
         if not self.armed:
             return
-        velocities = {OFFBOARD: self.velocity, LAND: np.array([0.0, 0.0, -0.5])}
-        desired = velocities.get(self.mode, np.zeros(3))
-        command = self.rates if self.mode == OFFBOARD else None
+        is_offboard, vehicle = self.mode == OFFBOARD, QuadrotorParams()
+        command = self.rates if is_offboard else None
         if command is None:
-            acceleration = tracking_acceleration(self.state[3:6], desired)
-            law, vehicle = FlatnessControllerConfig(), QuadrotorParams()
-            heading = self.heading if self.mode == OFFBOARD else np.nan
-            command = flatness_command(self.state, acceleration, np.zeros(3), heading, law, vehicle)
-        self.state = rk4_step(self.state, command, QuadrotorParams(), STEP)
+            descent = np.array([0.0, 0.0, -0.5 if self.mode == LAND else 0.0])
+            desired, heading = (self.velocity, self.heading) if is_offboard else (descent, np.nan)
+            a_WB = tracking_acceleration(self.state[3:6], desired)
+            law = FlatnessControllerConfig()
+            command = flatness_command(self.state, a_WB, np.zeros(3), heading, law, vehicle)
+        self.state = rk4_step(self.state, command, vehicle, STEP)
 
     def _tell(self, now: float) -> None:
         milliseconds = round((now - BOOT) * 1e3)
         if self.tick % 2 == 0:
             noise = 1e-4 * np.sin(now)  # [m]: an estimate is never the same for long.
             p, v = HALF_TURN.apply(self.state[:3] + noise), HALF_TURN.apply(self.state[3:6])
-            R_WB = Rotation.from_quat(np.roll(self.state[6:10], -1))
-            x, y, z, w = (HALF_TURN * R_WB * HALF_TURN.inv()).as_quat()
-            rates = HALF_TURN.apply(self.state[10:13])
-            due = now + self.delay
+            R_WB = Rotation.from_quat(self.state[6:10], scalar_first=True)
+            q = (HALF_TURN * R_WB * HALF_TURN.inv()).as_quat(scalar_first=True)
+            rates, due = HALF_TURN.apply(self.state[10:13]), now + self.delay
             position = dialect.MAVLink_local_position_ned_message(milliseconds, *p, *v)
-            q = (w, x, y, z)
             attitude = dialect.MAVLink_attitude_quaternion_message(milliseconds, *q, *rates)
             self.delayed += [(due, position), (due, attitude)]
         while self.delayed and self.delayed[0][0] <= now + 1e-9:
@@ -152,13 +139,9 @@ class Px4StandIn:
             base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
             base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
             custom = (self.mode[0] << 16) | (self.mode[1] << 24)
-            self._send(
-                dialect.MAVLink_heartbeat_message(
-                    dialect.MAV_TYPE_QUADROTOR,
-                    dialect.MAV_AUTOPILOT_PX4,
-                    *(base, custom, dialect.MAV_STATE_ACTIVE, 3),
-                )
-            )
+            kind = dialect.MAV_TYPE_QUADROTOR, dialect.MAV_AUTOPILOT_PX4
+            status = base, custom, dialect.MAV_STATE_ACTIVE, 3
+            self._send(dialect.MAVLink_heartbeat_message(*kind, *status))
 
     def _send(self, message) -> None:
         if self.peer is not None and message.get_type() not in self.muted:
