@@ -26,12 +26,6 @@ def pose_from_optitrack(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     return np.array([x, -z, y, qw, qx, -qz, qy])
 
 
-def thrust_to_px4(thrust: float, hover_thrust: float, gravity: float) -> float:
-    """Converts thrust over mass [m/s^2] to PX4's thrust from 0 to 1, which at `hover_thrust`,
-    PX4's MPC_THR_HOVER, carries the weight."""
-    return min(max(hover_thrust * thrust / gravity, 0.0), 1.0)
-
-
 _ONBOARD_COMPUTER = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 CUSTOM_MODE, ARMED = 1, 128  # MAV_MODE_FLAGs
 _RESULTS = "ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS"
@@ -113,13 +107,13 @@ class Mavlink:
     def body_rates(
         self, command: np.ndarray, hover_thrust: float, gravity: float, time: float
     ) -> bytes:
-        """Writes a command (4,): thrust over mass [m/s^2] and w_cmd_B [rad/s], see `thrust_to_px4`;
-        `time` [s] is since the start."""
+        """Writes a command (4,): thrust over mass [m/s^2] and w_cmd_B [rad/s]; `time` [s] is since
+        the start. PX4's thrust is from 0 to 1, and `hover_thrust`, MPC_THR_HOVER, in a hover."""
         return self.packed(
             "set_attitude_target",
             *(milliseconds(time), self._system, 1, BODY_RATES, [1.0, 0.0, 0.0, 0.0]),
             *map(float, swap_px4(command[1:])),
-            thrust_to_px4(float(command[0]), hover_thrust, gravity),
+            min(max(hover_thrust * float(command[0]) / gravity, 0.0), 1.0),
         )
 
     def odometry(self, pose: np.ndarray, utime: int) -> bytes:

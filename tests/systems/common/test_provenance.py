@@ -2,7 +2,7 @@ import importlib.metadata
 import importlib.util
 import shutil
 import subprocess
-from itertools import combinations
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,11 +23,8 @@ VERSION = importlib.metadata.version("splatpilot")
 
 
 def git(folder: Path, *words: str) -> str:
-    identity = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
-    command = ["git", *identity, *words]
-    return subprocess.run(
-        command, cwd=folder, check=True, capture_output=True, text=True
-    ).stdout.strip()
+    command = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c", *words]
+    return subprocess.check_output(command, cwd=folder, text=True).strip()
 
 
 def commit(folder: Path) -> str:
@@ -104,11 +101,9 @@ def test_revision_of_a_wheel_depends_on_its_files(checkout, monkeypatch):
 def test_ranges_of_seeds_are_filled_and_do_not_overlap():
     firsts = [first_training_seed(run) for run in range(1000)]
     assert firsts == list(range(TRAINING_SEEDS, VALIDATION_SEEDS, SEEDS_PER_RUN))
-    training = range(TRAINING_SEEDS, firsts[-1] + SEEDS_PER_RUN)
-    validation = range(VALIDATION_SEEDS, VALIDATION_SEEDS + SEEDS_PER_RUN)
-    ranges = [*STUDY_SEEDS.values(), training, validation, MONTE_CARLO_SEEDS]
-    for a, b in combinations(ranges, 2):
-        assert a[-1] < b[0] or b[-1] < a[0]
+    others = range(VALIDATION_SEEDS, VALIDATION_SEEDS + SEEDS_PER_RUN), MONTE_CARLO_SEEDS
+    ranges = *STUDY_SEEDS.values(), range(TRAINING_SEEDS, VALIDATION_SEEDS), *others
+    assert all(a[-1] < b[0] for a, b in pairwise(ranges))
 
 
 @pytest.mark.parametrize(

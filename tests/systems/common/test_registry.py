@@ -37,10 +37,8 @@ def package(folder, name: str, body: str, group: str = "", point: str = "") -> N
 
 
 def test_entries_are_found_by_name_and_by_configuration(registry):
-    assert registry.find("one") == Entry(OneConfig)
-    assert (
-        registry.entry_for(OneConfig()) == registry.entry_for(DerivedConfig()) == Entry(OneConfig)
-    )
+    for config in (OneConfig(), DerivedConfig()):
+        assert registry.entry_for(config) == registry.find("one") == Entry(OneConfig)
     registry.add("derived", Entry(DerivedConfig))
     assert registry.entry_for(DerivedConfig()) == Entry(DerivedConfig)
     with pytest.raises(ValueError, match=r"no toy 'two'; there are one, derived, and module:attr"):

@@ -14,16 +14,6 @@ from splatpilot.systems.common.validation import (
 )
 
 
-@dataclass
-class Lattice:
-    speed: float = -1.0
-
-
-@dataclass
-class Whole:
-    policy: dict[str, Lattice] = field(default_factory=lambda: {"a": Lattice(), "b": Lattice()})
-
-
 def test_a_value_is_named_with_its_condition_and_remedy():
     require(True, "--jobs", "at least 1", 1)
     with pytest.raises(ValueError, match=r"^--jobs must be at least 1, got 0; leave it out$"):
@@ -31,12 +21,12 @@ def test_a_value_is_named_with_its_condition_and_remedy():
 
 
 def test_a_field_is_named_by_its_path_within_the_whole_configuration():
-    whole = Whole()
+    whole = Outer(others={"a": Inner(), "b": Inner()})
     with pytest.raises(FieldError) as raised:
-        require_field(whole.policy["b"], "speed", False, "positive")
-    assert str(raised.value) == "Lattice.speed must be positive, got -1.0"
-    assert str(raised.value.within(whole)) == "policy.b.speed must be positive, got -1.0"
-    assert raised.value.within(Whole()) is raised.value
+        require_field(whole.others["b"], "share", False, "positive")
+    assert str(raised.value) == "Inner.share must be positive, got 0.5"
+    assert str(raised.value.within(whole)) == "others.b.share must be positive, got 0.5"
+    assert raised.value.within(Outer()) is raised.value
     sent = pickle.loads(pickle.dumps(raised.value))  # to another process
     assert str(sent) == str(raised.value)
 

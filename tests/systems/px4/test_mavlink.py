@@ -12,7 +12,7 @@ from pymavlink.rotmat import Vector3
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.px4 import mavlink
-from splatpilot.systems.px4.mavlink import pose_from_optitrack, swap_px4, thrust_to_px4
+from splatpilot.systems.px4.mavlink import pose_from_optitrack, swap_px4
 
 OURS = mavlink.Mavlink()
 PX4 = dialect.MAVLink(None, 1, 1)
@@ -45,13 +45,14 @@ def test_velocity_setpoint_is_in_the_local_frame():
     assert message.yaw == -0.5
 
 
-def test_body_rates_have_thrust_from_0_to_1():
-    message = received(OURS.body_rates(np.array([9.81, 0.5, 0.25, -0.125]), 0.375, 9.81, 0.0))
+@pytest.mark.parametrize(
+    ("thrust", "px4"), [(9.81, 0.375), (19.62, 0.75), (99.0, 1.0), (-1.0, 0.0)]
+)
+def test_body_rates_have_thrust_from_0_to_1(thrust, px4):
+    message = received(OURS.body_rates(np.array([thrust, 0.5, 0.25, -0.125]), 0.375, 9.81, 0.0))
     rates = message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate
-    assert (*rates, message.thrust) == (0.5, -0.25, 0.125, 0.375)
+    assert (*rates, message.thrust) == (0.5, -0.25, 0.125, px4)
     assert message.type_mask == mask("ATTITUDE_TARGET_TYPEMASK", "ATTITUDE") == 128
-    for thrust, px4 in ((9.81, 0.45), (19.62, 0.9), (99.0, 1.0), (-1.0, 0.0)):
-        assert thrust_to_px4(thrust, 0.45, 9.81) == px4
 
 
 def test_odometry_is_that_of_ekf2():
@@ -83,10 +84,8 @@ def test_px4s_estimates_are_in_our_frames():
         dialect.MAVLink_attitude_quaternion_message(2250, 0.5, 0.5, -0.5, 0.5, 0.1, 0.2, 0.3),
         dialect.MAVLink_system_time_message(0, 0),
     )
-    other = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(
-        dialect.MAVLink(None, 255, 190)
-    )
-    (heartbeat, position, attitude), refused = OURS.read(packet + bytes(other))
+    other = mavlink.Mavlink(255).heartbeat()
+    (heartbeat, position, attitude), refused = OURS.read(packet + other)
     assert heartbeat == mavlink.Heartbeat(True, mavlink.OFFBOARD)
     assert isinstance(position, mavlink.Position) and isinstance(attitude, mavlink.Attitude)
     assert (position.time, attitude.time, refused) == (2.5, 2.25, [])
