@@ -68,8 +68,7 @@ def splat_page(
 
     Args:
         meshcat_page: `Meshcat.StaticHtml()`.
-        title: name of the environment, `name` in the page's data.
-        data: further content, as for JSON.
+        title: name of the environment, `name` in the page's data, which is as for JSON.
         scripts: names of files in `page`, in the order of their dependencies.
         start: JavaScript of `splats` and `data` that runs last.
     """
@@ -301,15 +300,11 @@ def replay_page(
     require(flights, "flights", "at least one", 0)
     duration = max(flight.times[-1] for flight in flights)
     highest = max(QuadrotorState.of(flight.states).p_WB[:, 2].max() for flight in flights)
-    data = {
+    data = vars(view) | {
         "X_BC": view.X_BC.GetAsMatrix4().ravel().tolist(),
         "fov_y": np.degrees(view.fov_y),
-        "radius": view.radius,
-        "margin": view.margin,
         "unknown": view.num_frontier,
         "depth_scale": _depth_scale(max(f.frames.max_depth if f.frames else 1 for f in flights)),
-        "lower": view.lower,
-        "upper": view.upper,
         "cut": min(view.upper, highest + 2 * view.radius),
         "spheres": spheres and _sphere_tracks(spheres, duration),
         "flights": [

@@ -4,8 +4,7 @@
 class CaptureCameras {
   // `cameras`: {size, slope_x, slope_y, fov_y, poses, names, images}, see `pages.scene_page`.
   constructor(viewer, cameras) {
-    Object.assign(this, cameras);
-    this.viewer = viewer;
+    Object.assign(this, cameras, {viewer});
     this.poses = cameras.poses.map((pose) => new THREE.Matrix4().fromArray(pose).transpose());
     this.group = new THREE.Group();
     this.frusta = new THREE.LineSegments(

@@ -7,15 +7,11 @@
 
 class Replay {
   constructor(viewer, splats, data) {
-    Object.assign(this, data);
-    this.viewer = viewer;
-    this.splats = splats;
+    Object.assign(this, data, {viewer, splats, speed: 1, pictures: new Map()});
+    this.playing = this.depth = this.looping = false;
     this.flights = data.flights.map((flight, k) => new ReplayFlight(flight, k, this));
     this.duration = Math.max(...this.flights.map((flight) => flight.duration));
     this.X_BC = new THREE.Matrix4().fromArray(data.X_BC).transpose();
-    this.playing = this.depth = this.looping = false;
-    this.speed = 1;
-    this.pictures = new Map();
     for (const flight of this.flights) viewer.scene.add(flight.group);
     this.spheres = data.spheres && new ReplaySpheres(data.spheres);
     if (this.spheres) viewer.scene.add(this.spheres.mesh);

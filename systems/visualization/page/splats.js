@@ -8,10 +8,8 @@
 class Splats {
   // `packed`: Uint32Array, 8 words each, as `pack_gaussians` writes them.
   constructor(viewer, packed) {
-    this.viewer = viewer;
-    this.packed = packed;
+    Object.assign(this, {viewer, packed, count: packed.length / 8});
     this.floats = new Float32Array(packed.buffer, packed.byteOffset, packed.length);
-    this.count = packed.length / 8;
     const rows = Math.ceil(this.count / Splats.perRow);
     const texels = new Uint32Array(rows * Splats.perRow * 8);
     texels.set(packed);
