@@ -110,14 +110,16 @@ def test_a_link_to_a_folder_stays_a_link(tmp_path):
 
 def test_leftovers_of_ended_processes_are_removed(tmp_path):
     with written_atomically(tmp_path / "mine.txt") as mine:
-        mine.write_text("")
-        ended = mine.name.replace(str(os.getpid()), str(2**31 - 1))
-        (tmp_path / ended).touch()
+        ended, other = (
+            mine.name.replace(str(os.getpid()), str(2**31 - 1)),
+            tmp_path / ".mine.partial",
+        )
+        for file in (mine, tmp_path / ended, other):
+            file.touch()
         (tmp_path / f"{ended}b").mkdir()
-        (tmp_path / ".mine.partial").touch()
         require_writable_folder(tmp_path)
-        assert sorted(tmp_path.iterdir()) == sorted([tmp_path / ".mine.partial", mine])
-        (tmp_path / ".mine.partial").unlink()
+        assert set(tmp_path.iterdir()) == {other, mine}
+        other.unlink()
         require_unused(tmp_path, overwrite=False)
 
 
@@ -139,8 +141,8 @@ def test_paths_are_checked(tmp_path):
 
 def test_a_folder_belongs_to_one_configuration(tmp_path):
     file, other = tmp_path / "mine" / "flight.yaml", tmp_path / "other"
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / ".flight.1.partial.yaml").touch()
+    file.parent.mkdir()
+    (file.parent / ".flight.1.partial.yaml").touch()
     text = claim_folder(file, Scenario(seed=1))
     assert claim_folder(file, Scenario(seed=1)) == text == file.read_text()
     with pytest.raises(ValueError, match=r"holds another configuration, with seed: 1; choose"):
@@ -156,17 +158,14 @@ def test_a_folder_belongs_to_one_configuration(tmp_path):
 
 
 def test_a_locked_folder_is_refused_until_its_holder_ends(tmp_path):
-    folder = tmp_path / "out" / "folder"
-    folder.mkdir(parents=True)
-    holder = os.open(folder, os.O_RDONLY)
+    holder = os.open(tmp_path, os.O_RDONLY)
     fcntl.flock(holder, fcntl.LOCK_EX)
-    told = "folder is in use by another process; wait"
-    with pytest.raises(OSError, match=told), locked_folder(folder):
-        pass
+    with pytest.raises(OSError, match="is in use by another process; wait"):
+        locked_folder(tmp_path).__enter__()
     os.close(holder)
-    with locked_folder(folder):
-        (folder / "file").touch()
-    assert folder.is_dir()
+    with locked_folder(tmp_path):
+        pass
+    assert tmp_path.is_dir()
 
 
 def test_a_locked_folder_that_stays_empty_is_removed(tmp_path):

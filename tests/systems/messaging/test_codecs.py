@@ -122,23 +122,13 @@ def test_invalid_content_is_refused(codec, field, value, reason):
         codec.unpack(message, EPOCH)
 
 
-def depth_image() -> ImageDepth32F:
-    image = ImageDepth32F(5, 3)
-    image.mutable_data[..., 0] = np.linspace(0.0, 9.0, 15).reshape(3, 5)
-    image.mutable_data[0, 0, 0] = np.inf
-    return image
-
-
-def color_image() -> ImageRgba8U:
-    image = ImageRgba8U(4, 2)
-    image.mutable_data[:] = np.arange(32, dtype=np.uint8).reshape(2, 4, 4)
-    return image
-
-
-DEPTH, COLOR = (DepthImageCodec(depth_image(), "camera"), ColorImageCodec(color_image(), "camera"))
+DEPTH_IMAGE, COLOR_IMAGE = ImageDepth32F(5, 3), ImageRgba8U(4, 2)
+DEPTH_IMAGE.mutable_data.flat = [np.inf, *np.linspace(0.1, 9.0, 14)]
+COLOR_IMAGE.mutable_data.flat = np.arange(32)
+DEPTH, COLOR = DepthImageCodec(DEPTH_IMAGE, "camera"), ColorImageCodec(COLOR_IMAGE, "camera")
 IMAGES = [
-    (DEPTH, depth_image(), PixelType.kDepth32F, "depth_image"),
-    (COLOR, color_image(), PixelType.kRgba8U, "color_image"),
+    (DEPTH, DEPTH_IMAGE, PixelType.kDepth32F, "depth_image"),
+    (COLOR, COLOR_IMAGE, PixelType.kRgba8U, "color_image"),
 ]
 
 
@@ -196,17 +186,14 @@ def raw(data: bytes) -> dict:
         (raw(bytes(56) + b"\0\0\xc0\x7f"), "depths must be at least 0 m"),
         (raw(bytes(56) + b"\0\0\x80\xbf"), "depths must be at least 0 m"),
         ({"data": b"\0" * 20}, "compressed image is invalid"),
-        (
-            {"data": packed(DEPTH, depth_image()).images[0].data[:20]},
-            "bytes of the image must be 60",
-        ),
+        ({"data": packed(DEPTH, DEPTH_IMAGE).images[0].data[:20]}, "bytes of the image must be 60"),
         ({"compression_method": 3}, "must be none or zlib, got 3"),
         ({"width": 6}, r"must be \(5, 3, 5, 6\), got \(6, 3, 5, 6\)"),
         ({"channel_type": 5}, "must be"),
     ],
 )
 def test_other_images_are_refused(changes, reason):
-    message = packed(DEPTH, depth_image())
+    message = packed(DEPTH, DEPTH_IMAGE)
     for name, value in changes.items():
         setattr(message.images[0], name, value)
     with pytest.raises(ValueError, match=reason):
