@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from splatpilot.systems.common.files import written_atomically
-from splatpilot.systems.policies import student
-from splatpilot.systems.policies.agile_autonomy import AGILE_NETWORK, STATE_SIZE
+from splatpilot.systems.policies.agile_autonomy import AGILE_NETWORK
 from splatpilot.systems.policies.checkpoint import (
     PolicyCheckpoint,
     checkpoint_policy,
@@ -22,6 +21,7 @@ from splatpilot.systems.policies.checkpoint import (
 from splatpilot.systems.policies.depthnav import DEPTHNAV_NETWORK
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.policies.diffaero_rgb import CHANNELS, HEIGHT, WIDTH
+from splatpilot.systems.policies.student import load_checkpoint
 from splatpilot.training.policies.networks import (
     StudentModule,
     TrainableNetwork,
@@ -30,10 +30,11 @@ from splatpilot.training.policies.networks import (
 )
 from splatpilot.training.policies.train_diffaero_rgb import DistilledRgbModule
 
-_RECURRENT = {
-    "diffaero": DIFFAERO_NETWORK,
-    "diffaero_tof": DIFFAERO_NETWORK,
-    "depthnav": DEPTHNAV_NETWORK,
+_NETWORKS = {
+    "diffaero": (DIFFAERO_NETWORK, TrainableNetwork),
+    "diffaero_tof": (DIFFAERO_NETWORK, TrainableNetwork),
+    "depthnav": (DEPTHNAV_NETWORK, TrainableNetwork),
+    "agile_autonomy": (AGILE_NETWORK, TrajectoryModule),
 }
 
 
@@ -54,29 +55,24 @@ def export(weights: Path, out: Path) -> None:
     `image`, `state` and, with memory, `hidden`; outputs `output` and `next_hidden`, or `waypoints`
     and `costs`."""
     policy = checkpoint_policy(weights)
-    if policy in _RECURRENT:
-        spec = _RECURRENT[policy]
-        module = TrainableNetwork(spec)
+    if policy in _NETWORKS:
+        spec, make = _NETWORKS[policy]
+        module = network = make(spec)
         load_weights(module, PolicyCheckpoint.load(weights, policy, spec))
-        sizes = [spec.image_size()[1:], (spec.state_size,), (spec.hidden_size,)]
+        image = spec.image_size()[1:]
     elif policy == "distilled_rgb":
-        module = _Distilled(DistilledRgbModule(str(weights)))
-        spec = module.networks.spec.policy
-        sizes = [(CHANNELS, HEIGHT, WIDTH), (spec.state_size,), (spec.hidden_size,)]
-    elif policy == "agile_autonomy":
-        spec = AGILE_NETWORK
-        module = TrajectoryModule(spec)
-        load_weights(module, PolicyCheckpoint.load(weights, policy, spec))
-        sizes = [spec.image_size()[1:], (STATE_SIZE,)]
+        networks = DistilledRgbModule(str(weights))
+        module, network, image = _Distilled(networks), networks.policy, (CHANNELS, HEIGHT, WIDTH)
     elif policy in ("student_rgb", "student_depth"):
-        checkpoint = student.load_checkpoint(str(weights), policy.removeprefix("student_"))
-        spec = checkpoint.spec
-        module = StudentModule(spec)
+        checkpoint = load_checkpoint(str(weights), policy.removeprefix("student_"))
+        module = network = StudentModule(checkpoint.spec)
         load_weights(module, checkpoint)
-        sizes = [(3, spec.height, spec.width), (student.STATE_SIZE,)]
+        image = 3, checkpoint.spec.height, checkpoint.spec.width
     else:
         raise ValueError(f"{weights}: the policy {policy!r} has no export")
-    recurrent = len(sizes) == 3
+    sizes, recurrent = [image, (network.state_layer.in_features,)], hasattr(network, "memory")
+    if recurrent:
+        sizes.append((network.memory.hidden_size,))
     with written_atomically(out) as partial:
         torch.onnx.export(
             module.eval(),

@@ -35,6 +35,7 @@ from splatpilot.training.policies.rollouts import (
     FlightTraining,
     render_depth,
 )
+from splatpilot.training.policies.train_student import hypothesis_errors
 from splatpilot.training.policies.trainer import Schedule
 from splatpilot.training.policies.training_worlds import STARTS
 
@@ -159,8 +160,7 @@ class AgileAutonomyTrainer(FlightTrainer):
         sample = {name: values[chosen] for name, values in data.items()}
         depth = noisy_depth(sample["depth"].float(), config.noise, self.generator)
         waypoints, costs = self.network(self.agent.encode_depth(depth), sample["state"])
-        errors = (sample["experts"][:, :, None] - waypoints[:, None]).square().sum((3, 4))
-        errors = (10.0 / (3 * NUM_WAYPOINTS)) * errors  # (N, K, M)
+        errors = hypothesis_errors(sample["experts"], waypoints[:, None])  # (N, K, M)
         pull = torch.full_like(errors, EPSILON / (agile_autonomy.MODES - 1))
         pull.scatter_(2, errors.argmin(2, keepdim=True), 1.0 - EPSILON)
         imitated = (pull * errors).sum(2) * sample["imitated"]
@@ -247,8 +247,7 @@ class AgileAutonomyTrainer(FlightTrainer):
 
     def _start(self, world: Tensor, student: float) -> tuple[vehicles.BodyRate, Tensor]:
         """Places vehicles at rest in their worlds; draws which of them the student flies."""
-        N, device = len(world), world.device
-        draws = torch.rand(N, 3, generator=self.generator, device=device)
+        draws = torch.rand(len(world), 3, generator=self.generator, device=world.device)
         p = self.worlds.starts_W[world, (draws[:, 0] * STARTS).long().clamp(max=STARTS - 1)]
         direction = self.worlds.direction(p, world)
         yaw = torch.atan2(direction[:, 1], direction[:, 0]) + 1.5 * (draws[:, 1] - 0.5)

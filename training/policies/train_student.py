@@ -326,9 +326,10 @@ class StudentDepthTraining(StudentTraining):
 
 
 def hypothesis_errors(expert: Tensor, waypoints: Tensor) -> Tensor:
-    """Computes L_m (N, M) = 10 / (3 T) sum_t |T*_t - T_mt|^2 [m^2] of T* (N, T, 3) [m], the
-    expert's, and T_m (N, M, T, 3) [m]."""
-    return 10.0 / (3 * expert.shape[1]) * (expert[:, None] - waypoints).square().sum((2, 3))
+    """Computes L_m (..., M) = 10 / (3 T) sum_t |T*_t - T_mt|^2 [m^2] of T* (..., T, 3) [m], the
+    expert's, and T_m (..., M, T, 3) [m]."""
+    squares = (expert.unsqueeze(-3) - waypoints).square().sum((-2, -1))
+    return 10.0 / (3 * expert.shape[-2]) * squares
 
 
 def imitation_terms(errors: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
