@@ -4,7 +4,7 @@ import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from ipaddress import ip_address
+from ipaddress import IPv4Address
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +58,7 @@ class Px4Config(Config):
         require_field(self, "body", named, "a name, which motion_capture needs")
         host, senders = self.vehicle_host, self.udp.senders
         require(host in senders, "udp.senders", f"a list with vehicle_host, {host}", senders)
-        is_reached = ip_address(host).is_loopback or not ip_address(self.udp.host).is_loopback
+        is_reached = IPv4Address(host).is_loopback or not IPv4Address(self.udp.host).is_loopback
         condition = "0.0.0.0 or an address that the vehicle reaches"
         require(is_reached, "udp.host", condition, self.udp.host)
 

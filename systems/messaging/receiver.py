@@ -8,6 +8,7 @@ import struct
 import weakref
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from ipaddress import AddressValueError, IPv4Address
 from typing import Any, Protocol, Self, cast
 
 import numpy as np
@@ -132,15 +133,15 @@ class UdpConfig(Config):
         for name, addresses in given.items():
             valid = all(map(_is_address, addresses))
             require_field(self, name, valid, "an IPv4 address, as 127.0.0.1")
-        multicast = not self.group or 224 <= int(self.group.partition(".")[0]) <= 239
+        multicast = not self.group or IPv4Address(self.group).is_multicast
         require_field(self, "group", multicast, "in 224.0.0.0 to 239.255.255.255")
         require_field(self, "senders", self.senders, "a list of at least one address")
 
 
 def _is_address(address: str) -> bool:
     try:
-        socket.inet_aton(address)
-    except OSError:
+        IPv4Address(address)
+    except AddressValueError:
         return False
     return True
 

@@ -55,8 +55,3 @@ class Halves:
 
     def mode(self) -> tuple[float, float]:
         return tuple(self.out("status")[:2])
-
-    def enable_motion_capture(self, enabled: bool) -> None:
-        sender = self.vehicle.GetSubsystemByName("motion_capture_pose_publisher")
-        context = sender.GetMyMutableContextFromRoot(self.vehicle_root)
-        sender.GetInputPort("enabled").FixValue(context, [float(enabled)])

@@ -137,12 +137,14 @@ def test_an_infinite_heading_ends_no_flight(post_world):
 
 def test_a_body_that_motion_capture_does_not_see_is_not_flown(post_world):
     halves = Halves(STRAIGHT, post_world, body="starling")
+    sender = halves.vehicle.GetSubsystemByName("motion_capture_pose_publisher")
+    context = sender.GetMyMutableContextFromRoot(halves.vehicle_root)
     for sees, until, mode in (
-        (False, 0.4, (status.WAITING, status.NONE)),
-        (True, 0.8, (status.FLYING, status.NONE)),
-        (False, 1.2, (status.HOLDING, status.BODY_LOST)),
+        (0.0, 0.4, (status.WAITING, status.NONE)),
+        (1.0, 0.8, (status.FLYING, status.NONE)),
+        (0.0, 1.2, (status.HOLDING, status.BODY_LOST)),
     ):
-        halves.enable_motion_capture(sees)
+        sender.GetInputPort("enabled").FixValue(context, [sees])
         halves.advance_to(until)
         assert halves.mode() == mode
 

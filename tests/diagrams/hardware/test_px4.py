@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import re
 import socket
 
@@ -42,22 +43,19 @@ class Steps:
 
     def __init__(self, **diagrams):
         self.diagrams, self.alive, self.now = diagrams, set(diagrams), 0.0
-        self.before, self.after = [], []  # Functions that each step calls.
         self.simulators = {name: Simulator(diagram) for name, diagram in diagrams.items()}
         for name, diagram in diagrams.items():
             root = self.simulators[name].get_mutable_context()
             diagram.GetSubsystemByName("clock").set_epoch(root, EPOCH)
 
     def advance(self, duration: float) -> None:
-        until = self.now + duration
-        while self.now < until - 1e-9:
+        for _ in range(round(duration / 0.01)):
             self.now += 0.01
-            for act in self.before:
-                act()
-            for name in sorted(self.alive):
-                self.simulators[name].AdvanceTo(self.now)
-            for act in self.after:
-                act()
+            self.step()
+
+    def step(self) -> None:
+        for name in sorted(self.alive):
+            self.simulators[name].AdvanceTo(self.now)
 
     def out(self, port: str, diagram: str = "bridge") -> np.ndarray:
         root = self.simulators[diagram].get_context()
@@ -73,29 +71,26 @@ class Chain(Steps):
     def __init__(
         self, world, version="1.18", commander=ENGAGED, body="", policy=None, hardware=None, sees=""
     ):
-        self.px4 = Px4StandIn(version, START)
-        self.inbox = UdpInbox(UdpConfig(port=0))
-        self.px4.peer = ("127.0.0.1", self.inbox.port)
-        self.lcm = lcm.LCM("memq://")
+        self.px4, self.inbox = Px4StandIn(version, START), UdpInbox(UdpConfig(port=0))
+        self.px4.peer, self.lcm = ("127.0.0.1", self.inbox.port), lcm.LCM("memq://")
         scenario = Scenario(policy=policy_named("straight", 1.0), start=START, goal=GOAL)
         config = Px4Config(vehicle_port=self.px4.port, commander=commander, body=body, tick=0.01)
         if sees:
-            udp = UdpConfig(port=0)
-            config.motion_capture = MotionCaptureConfig(udp, body_id=3, version=[4, 0])
+            config.motion_capture = MotionCaptureConfig(UdpConfig(port=0), 3, version=[4, 0])
         hardware = dataclasses.replace(hardware or HardwareConfig(), tick=0.01)
         bridge = BuildHardwareDiagram(scenario, world, self.lcm, hardware, policy=policy)
         super().__init__(bridge=bridge, link=BuildPx4Diagram(config, self.lcm, self.inbox))
-        self.sees, self.before = sees, [self._see] if sees else []
-        self.after = [lambda: self.px4.step(self.now)]
-        self.cameras = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.sees, self.cameras = sees, socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
-    def _see(self) -> None:
-        """Sends a frame of 100 Hz in which cameras, whose y is up, see PX4's vehicle or nothing."""
-        (x, y, z), q = self.px4.state[:3], self.px4.state[6:10]
-        pose = [x, z, -y], [q[1], q[3], -q[2], q[0]]
-        frame = natnet_frame(round(100 * self.now), 3, *pose, self.sees == "body")
-        receiver = self.diagrams["link"].GetSubsystemByName("motion_capture_receiver")
-        self.cameras.sendto(frame, ("127.0.0.1", receiver.port))
+    def step(self) -> None:
+        if self.sees:  # Cameras, whose y is up, see PX4's vehicle or nothing.
+            (x, y, z), q = self.px4.state[:3], self.px4.state[6:10]
+            pose = [x, z, -y], [q[1], q[3], -q[2], q[0]]
+            frame = natnet_frame(round(100 * self.now), 3, *pose, self.sees == "body")
+            receiver = self.diagrams["link"].GetSubsystemByName("motion_capture_receiver")
+            self.cameras.sendto(frame, ("127.0.0.1", receiver.port))
+        super().step()
+        self.px4.step(self.now)
 
 
 @pytest.fixture
@@ -309,6 +304,7 @@ def test_the_process_prints_its_limits_and_missing_heartbeats(udp_url, capsys, m
         ("--arm", "arm must be false without engage"),
         ("--set motion_capture={}", "body must be a name, which motion_capture needs"),
         ("--set system=0", "system must be in [1, 255], got 0"),
+        ("--set vehicle_host=127.0.1", "host must be an IPv4 address, as 127.0.0.1, got 127.0.1"),
         ("--set vehicle_host=192.168.8.1", "udp.senders must be a list with vehicle_host, 192."),
         (
             "--set vehicle_host=192.168.8.1 --set udp.senders=[192.168.8.1]",
@@ -333,7 +329,8 @@ VELOCITY = (0.5, 0.0, 0.0)
 class Replay(Steps):
     """Bridge and PX4's messages, of a log."""
 
-    def __init__(self, path, world):
+    def __init__(self, path, world, velocity, **kwargs):
+        write_log(path, velocity, **kwargs)
         self.inbox, memory = LogInbox(path, 1, lambda: self.now), lcm.LCM("memq://")
         scenario = Scenario(policy=policy_named("straight", 1.0), goal=GOAL)
         bridge = BuildHardwareDiagram(scenario, world, memory)
@@ -342,11 +339,7 @@ class Replay(Steps):
 
 @pytest.fixture
 def replay(tmp_path, post_world):
-    def make(*args, **kwargs) -> Replay:
-        write_log(tmp_path / "flight.ulg", *args, **kwargs)
-        return Replay(tmp_path / "flight.ulg", post_world)
-
-    return make
+    return functools.partial(Replay, tmp_path / "flight.ulg", post_world)
 
 
 def test_the_state_of_a_log_reaches_the_bridge_whose_setpoints_are_counted(replay):

@@ -110,10 +110,8 @@ def test_a_link_to_a_folder_stays_a_link(tmp_path):
 
 def test_leftovers_of_ended_processes_are_removed(tmp_path):
     with written_atomically(tmp_path / "mine.txt") as mine:
-        ended, other = (
-            mine.name.replace(str(os.getpid()), str(2**31 - 1)),
-            tmp_path / ".mine.partial",
-        )
+        ended = mine.name.replace(str(os.getpid()), str(2**31 - 1))
+        other = tmp_path / ".mine.partial"
         for file in (mine, tmp_path / ended, other):
             file.touch()
         (tmp_path / f"{ended}b").mkdir()
