@@ -44,6 +44,17 @@ def single_gaussian(
     }
 
 
+def repeated(scene: dict[str, Any], count: int) -> dict[str, Any]:
+    return scene | {name: scene[name].repeat_interleave(count, 0) for name in SCENE}
+
+
+def leaves(scene: dict[str, Any], dtype=torch.float32) -> dict[str, Any]:
+    return {
+        name: tensor.detach().to(dtype, copy=True).requires_grad_(name != "Ks")
+        for name, tensor in scene.items()
+    }
+
+
 def rotation_matrices(quats: Tensor) -> Tensor:
     """(N, 4) wxyz of any length -> (N, 3, 3)."""
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)

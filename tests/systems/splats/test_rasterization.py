@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_scenes import normal_tensor, random_scene
-from reference_rasterizer import SCENE, single_gaussian
+from reference_rasterizer import SCENE, leaves, repeated, single_gaussian
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -29,17 +29,6 @@ SMALL: dict[str, Any] = {"width": 33, "height": 33}
 MODES = ["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RASTERIZE_MODES = ["classic", "antialiased"]
 DRAWS = [rasterize, rasterize_surfels]
-
-
-def leaves(scene: dict[str, Any], dtype=torch.float32) -> dict[str, Any]:
-    return {
-        name: tensor.detach().to(dtype, copy=True).requires_grad_(name != "Ks")
-        for name, tensor in scene.items()
-    }
-
-
-def repeated(scene: dict[str, Any], count: int) -> dict[str, Any]:
-    return scene | {name: scene[name].repeat_interleave(count, 0) for name in SCENE}
 
 
 def with_backgrounds(scene) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import reference_surfels as reference
 import torch
 from random_scenes import normal, normal_tensor
 from random_scenes import random_scene as random_gaussians
-from reference_rasterizer import SCENE, rotation_matrices, single_gaussian
+from reference_rasterizer import SCENE, leaves, repeated, rotation_matrices, single_gaussian
 
 from splatpilot import _native
 from splatpilot.systems.splats import surfel_rasterization
@@ -66,16 +66,14 @@ def test_images_agree_with_reference():
 
 
 def loss_gradients(call, scene, clear, dtype) -> dict[str, torch.Tensor]:
-    leaves = {
-        k: v.detach().clone().to(dtype).requires_grad_(k in LEARNED) for k, v in scene.items()
-    }
-    images = call(leaves)
+    inputs = leaves(scene, dtype)
+    images = call(inputs)
     loss = torch.zeros(())
     for seed, name in enumerate(OUTPUTS):
         weight = normal_tensor(seed, *images[name].shape).to(dtype)
         loss = loss + (images[name] * weight)[clear].sum()
     loss.backward()
-    return {name: leaves[name].grad.double() for name in LEARNED}
+    return {name: inputs[name].grad.double() for name in LEARNED}
 
 
 def reference_gradients(scene, clear, dtype=torch.float64, **options) -> dict[str, torch.Tensor]:
@@ -151,7 +149,7 @@ def tilted_plane(tilt=1.1) -> tuple[dict[str, Any], torch.Tensor, torch.Tensor]:
     sides = torch.tensor([[2.0, 0, 0], [0.0, 3 * math.cos(tilt), 3 * math.sin(tilt)]])
     # The z axis is minus the normal.
     scene = single_gaussian(scale=0.15, quat=(math.cos(tilt / 2), math.sin(tilt / 2), 0.0, 0.0))
-    scene |= {name: scene[name].repeat_interleave(count, 0) for name in SCENE}
+    scene = repeated(scene, count)
     scene["means"] += (torch.rand(count, 2, generator=g) - 0.5) @ sides
     y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
     rays = torch.stack([x / 100, y / 100, torch.ones_like(x)], -1)
@@ -195,9 +193,7 @@ def test_depth_without_a_plane_has_no_normal():
 
 @pytest.mark.parametrize("quat", [(1.0, 1.0, 0, 0), (1.0, 1.0 + 1e-6, 0, 0), (1.0, 1.001, 0, 0)])
 def test_edge_on_surfel_is_its_blob(quat):
-    scene = single_gaussian(quat=quat)
-    for name in LEARNED:
-        scene[name] = scene[name].requires_grad_()
+    scene = leaves(single_gaussian(quat=quat))
     images = render(scene, width=33, height=33)
     assert images["alpha"][16, 16].item() == pytest.approx(0.5, abs=1e-5)
     assert images["depth"][16, 16].item() == pytest.approx(1.0, abs=1e-4)
