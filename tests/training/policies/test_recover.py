@@ -9,11 +9,7 @@ import torch
 from splatpilot.diagrams.flight.simulation import fly
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.policies.checkpoint import checkpoint_policy
-from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.training.corpus import collect
-from splatpilot.training.corpus.corpus import EXPERT, RECOVERY, Corpus, CorpusConfig
-from splatpilot.training.corpus.expert import ExpertConfig
-from splatpilot.training.corpus.library import LibraryConfig
+from splatpilot.training.corpus.corpus import EXPERT, RECOVERY, Corpus
 from splatpilot.training.policies import recover as recovery
 from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
 from splatpilot.training.policies.train_student import (
@@ -26,25 +22,10 @@ TINY = ["pretrained=false", "frozen=0", "held_out=0.5", "batch=2"]
 TINY += ["schedule.updates=2", "schedule.checkpoint_every=2"]
 
 
-def collect_corpus(folder: Path, worlds: Path, camera: OnboardCamera) -> None:
-    """Collects one short flight in each of two small forests."""
-    grove = worlds / "grove.yaml"
-    grove.write_text("world: !ForestConfig {length: 10, width: 8, height: 4}\n")
-    config = CorpusConfig(
-        worlds=LibraryConfig(kinds=[str(grove)]),
-        expert=ExpertConfig(period=0.5, speed=1.5),
-        flights=1,
-        camera=camera,
-    )
-    collect.run(config=config, out=folder, worlds=2, jobs=1)
-
-
 @pytest.fixture(scope="module")
-def expert(tmp_path_factory) -> Path:
-    """The folder of a corpus in depth and colors for students."""
-    folder = tmp_path_factory.mktemp("expert")
-    collect_corpus(folder, tmp_path_factory.mktemp("worlds"), OnboardCamera(width=32, height=24))
-    return folder
+def expert(collected, tmp_path_factory) -> Path:
+    """The folder of a copy of the corpus of two worlds."""
+    return shutil.copytree(collected.folder, tmp_path_factory.mktemp("expert") / "corpus")
 
 
 def configure(corpus: Path | str) -> StudentDepthTraining:
@@ -174,13 +155,12 @@ def test_recovery_share_is_the_fraction_of_recovery_samples(expert, recovered):
     assert set(plain.draw(4000, generator, 0.5)) == set(plain.training)
 
 
-def test_rgb_policy_recovers_too(tmp_path, flown):
-    collect_corpus(tmp_path / "expert", tmp_path, OnboardCamera(width=160, height=90))
+def test_rgb_policy_recovers_too(wide_corpus, tmp_path, flown):
     tiny = [setting for setting in TINY if not setting.startswith(("pretrained", "frozen"))]
-    overrides = [f"corpora=[{tmp_path / 'expert'}]", *tiny]
+    overrides = [f"corpora=[{wide_corpus}]", *tiny]
     config = load_config(DiffAeroRgbTraining(), overrides=overrides)
     out = tmp_path / "out"
     ledger = recovery.run(config=config, make=DiffAeroRgbTrainer, out=out, flights=1, jobs=1)
     assert sum(ledger["flights"].values()) == 1 and ledger["recovery_samples"] > 0
-    assert [policy.speed for policy in flown] == [1.5]
+    assert [policy.speed for policy in flown] == [2.0]
     assert checkpoint_policy(out / "stage_2" / "diffaero_rgb.npz") == "diffaero_rgb"

@@ -41,8 +41,8 @@ from splatpilot.training.policies.vehicles import BodyRate, Observation, PointMa
 
 
 def of_corpus(corpus: Path, *overrides: str) -> DiffAeroRgbTraining:
-    settings = [f"corpora=[{corpus}]", "held_out=0.2", "batch=8", "schedule.updates=40"]
-    settings += ["schedule.validate_every=40", "schedule.checkpoint_every=20"]
+    settings = [f"corpora=[{corpus}]", "held_out=0.05", "batch=8", "schedule.updates=40"]
+    settings += ["schedule.validate_every=40", "schedule.checkpoint_every=10"]
     return load_config(DiffAeroRgbTraining(), overrides=[*settings, *overrides])
 
 

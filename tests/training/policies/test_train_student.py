@@ -30,23 +30,23 @@ from splatpilot.training.policies.train_student import (
     rank,
 )
 
-HELD_OUT = 0.2  # of three worlds, which holds out one
+HELD_OUT = 0.05  # which holds out the second of three worlds
 
 
 @pytest.fixture(scope="module")
 def two(student_corpus, tmp_path_factory) -> list[Corpus]:
-    """The corpus of 72 samples, and a copy without the 24 of one of its three worlds."""
+    """The corpus of three worlds, and a copy without the samples of the last."""
     part = tmp_path_factory.mktemp("part") / "corpus"
     shutil.copytree(student_corpus, part)
-    shutil.rmtree(part / "shards" / "expert-pillars-1")
+    shutil.rmtree(part / "shards" / "expert-grove-1000002")
     return [Corpus(student_corpus), Corpus(part)]
 
 
 def test_worlds_stay_held_out_as_corpora_grow(two):
     alone, joined = StudentData(two[1:], HELD_OUT), StudentData(two[::-1], HELD_OUT)
     assert alone.held_out_worlds == joined.held_out_worlds and len(alone.held_out_worlds) == 1
-    for data, count in ((alone, 48), (joined, 72)):
-        assert sorted([*data.training, *data.held_out]) == list(range(count))
+    for data, corpus in ((alone, two[1]), (joined, two[0])):
+        assert sorted([*data.training, *data.held_out]) == list(range(len(corpus)))
         outside = {data.worlds[w] for w in data.labels(data.held_out).world}
         inside = {data.worlds[w] for w in data.labels(data.training).world}
         assert outside == set(data.held_out_worlds) and not outside & inside
@@ -54,13 +54,13 @@ def test_worlds_stay_held_out_as_corpora_grow(two):
 
 def test_samples_keep_their_order_and_world(two):
     data = StudentData(two[::-1], HELD_OUT)
-    numbers = np.array([60, 3, 47, 48, 5, 71])
+    shared = len(two[1])
+    numbers = np.array([shared + 12, 3, shared - 1, shared, 5, len(two[0]) - 1])
     depth, color = data.pixels(numbers, "depth"), data.pixels(numbers, "color")
     labels = data.labels(numbers)
-    first = len(two[0].shards[0])
     for row, number in enumerate(numbers):
-        corpus, within = (two[1], number) if number < 48 else (two[0], first + number - 48)
-        one = corpus.samples(np.array([within]))
+        corpus = two[int(number < shared)]
+        one = corpus.samples(np.array([number]))
         np.testing.assert_array_equal(depth[row], one.depth[0])
         np.testing.assert_array_equal(color[row], one.color[0])
         np.testing.assert_array_equal(labels.trajectories_B[row], one.trajectories_B[0])
@@ -104,11 +104,14 @@ def test_corpora_of_test_scenes_or_for_validation_are_refused(two, monkeypatch):
 
 def test_worlds_of_one_scene_are_on_one_side(two, monkeypatch):
     records = {record.name: record for record in two[0].worlds}
-    assert 0 < len(held_out_worlds(records, HELD_OUT)) < len(records)
-    for record in records.values():
-        monkeypatch.setattr(record.source, "source_digest", ["0123456789abcdef"])
-    assert len(held_out_worlds(records, 0.01)) in (0, len(records))
-    assert len(held_out_worlds(records, 1.0)) == len(records)
+    first, second, _ = records
+    sides = [held_out_worlds(records, fraction) for fraction in np.linspace(0.0, 1.0, 50)]
+    assert any((first in held_out) != (second in held_out) for held_out in sides)
+    for name in (first, second):
+        monkeypatch.setattr(records[name].source, "source_digest", ["0123456789abcdef"])
+    sides = [held_out_worlds(records, fraction) for fraction in np.linspace(0.0, 1.0, 50)]
+    assert all((first in held_out) == (second in held_out) for held_out in sides)
+    assert {len(held_out) for held_out in sides} == {0, 1, 3}
 
 
 def test_ranks_of_names_are_uniform():
@@ -127,9 +130,9 @@ def test_corpora_that_differ_or_hold_out_too_many_or_few_worlds_are_refused(two,
     wide = Corpus(two[1].folder)
     wide.config = replace(config, camera=replace(config.camera, fov_x=100.0))
     for corpora, held_out, message in (
-        ([two[0], Corpus(other.folder)], HELD_OUT, r"pillars-1 and .*pillars-1 are different wor"),
+        ([two[0], Corpus(other.folder)], HELD_OUT, r"grove-1000001 and .*grove-1000001 are diff"),
         ([two[0], wide], HELD_OUT, "cameras of the corpora must be equal"),
-        (two[:1], 0.16, r"0 of 3 worlds are held out, .* set held_out to 0\.17"),
+        (two[:1], 0.005, r"0 of 3 worlds are held out, .* set held_out to 0\.01"),
         (two[:1], 1.0, "3 of 3 worlds are held out, which leaves 0 samples"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -167,7 +170,7 @@ def test_features_are_computed_once_for_the_same_weights(student_corpus, tmp_pat
     assert len(list(tmp_path.iterdir())) == 2 * len(made)
 
 
-OVERRIDES = ["pretrained=false", "frozen=0", "held_out=0.2", "batch=8", "schedule.updates=25"]
+OVERRIDES = ["pretrained=false", "frozen=0", "held_out=0.05", "batch=8", "schedule.updates=25"]
 OVERRIDES += ["schedule.validate_every=25", "schedule.checkpoint_every=5"]
 OVERRIDES += ["schedule.learning_rate=0.002"]
 ONE_STEP = [f"schedule.{name}=1" for name in ("updates", "validate_every", "checkpoint_every")]

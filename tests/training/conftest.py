@@ -1,3 +1,6 @@
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -24,3 +27,17 @@ def small(tmp_path_factory) -> CorpusConfig:
 def collected(small, tmp_path_factory) -> Corpus:
     """A corpus of two worlds; not to be written to."""
     return collect.run(config=small, out=tmp_path_factory.mktemp("corpus"), worlds=2, jobs=1)
+
+
+@pytest.fixture(scope="session")
+def student_corpus(small, tmp_path_factory) -> Path:
+    """The folder of a corpus of three worlds; not to be written to."""
+    out = tmp_path_factory.mktemp("student_corpus")
+    return collect.run(config=small, out=out, worlds=3, jobs=1).folder
+
+
+@pytest.fixture(scope="session")
+def wide_corpus(small, tmp_path_factory) -> Path:
+    """The same with images of 160x120."""
+    config, out = replace(small, camera=OnboardCamera(160, 120)), tmp_path_factory.mktemp("wide")
+    return collect.run(config=config, out=out, worlds=3, jobs=1).folder
