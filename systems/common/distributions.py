@@ -239,7 +239,7 @@ def _take(node: yaml.Node, path: FieldPath, found: dict[FieldPath, Any]) -> None
     for index, item in enumerate(node.value):
         key, value = (index, item) if is_list else (item[0].value, item[1])
         inner = (*path, key)
-        if not is_list and _TRANSFORM.fullmatch(key):
+        if _TRANSFORM.fullmatch(str(key)):
             kept.append(item)
         elif value.tag in _KINDS:
             found[inner] = _read(value, inner)

@@ -48,9 +48,9 @@ class Registry[Entry]:
         ]
         if name not in again and self._entries.get(name, entry) != entry:
             raise ValueError(f"there is a {self.what} {name!r} already; choose another name")
-        for other in self.configs() if config is not None else ():
-            ours, theirs = _qualified_name(config), _qualified_name(other)
-            if config.__name__ == other.__name__ and ours != theirs:
+        for other in self.configs():
+            ours, theirs = _qualified_name(config or other), _qualified_name(other)
+            if ours != theirs and ours.rpartition(".")[2] == theirs.rpartition(".")[2]:
                 raise ValueError(
                     f"{ours} has the name of {theirs}, and files could not tell them apart; "
                     "rename it"
