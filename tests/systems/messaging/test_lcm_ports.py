@@ -1,3 +1,4 @@
+import contextlib
 import os
 import resource
 import socket
@@ -34,20 +35,16 @@ def test_urls_that_do_not_deliver_are_refused(udp_url):
 
 
 def test_too_many_open_files_are_an_error_and_no_crash():
-    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if limits[1] != resource.RLIM_INFINITY and limits[1] < 1100:
-        pytest.skip(f"this process may open {limits[1]} files only")
-    resource.setrlimit(resource.RLIMIT_NOFILE, (max(limits[0], 1100), limits[1]))
-    files = []
-    try:
-        while not files or files[-1] < 1000:
-            files.append(os.open(os.devnull, os.O_RDONLY))
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < 1100:
+        pytest.skip(f"this process may open {hard} files only")
+    with contextlib.ExitStack() as stack:
+        stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, 1100), hard))
+        while stack.enter_context(open(os.devnull)).fileno() < 1000:
+            pass
         with pytest.raises(OSError, match="at most 1000 files may be open"):
             lcm_ports.open_lcm("memq://")
-    finally:
-        for file in files:
-            os.close(file)
-        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
 def published(publisher, until: float, inputs) -> list:
@@ -247,8 +244,8 @@ def test_invalid_logs_are_errors(tmp_path):
         with pytest.raises(error, match=name):
             lcm_ports.replay(tmp_path / name, ours.lcm, ours.simulator, ours.clock)
     for name, error in (("junk", FileExistsError), ("no folder/log", OSError)):
-        with pytest.raises(error), lcm_ports.recorded(ours.lcm, tmp_path / name):
-            pass
+        with pytest.raises(error):
+            lcm_ports.recorded(ours.lcm, tmp_path / name).__enter__()
 
 
 @pytest.mark.parametrize(

@@ -80,16 +80,12 @@ def test_position_and_attitude_are_brought_to_the_time_of_the_older(link, late):
     start = link.boot_time
     link.send(position(start), attitude(start, yaw=1.0, rate=2.0))
     link.advance(0.04)
-    newer = (
-        position(start + 0.04, x=1.02) if late == "attitude" else attitude(start + 0.04, 1.08, 2)
-    )
-    link.send(newer)
+    newer = {"position": attitude(start + 0.04, 1.08, 2), "attitude": position(start + 0.04, 1.02)}
+    link.send(newer[late])
     link.advance(0.01)
-    state = link.out("state")
     assert link.out("age") == pytest.approx(0.05, abs=1e-3)
-    assert state[0] == pytest.approx(1.0, abs=1e-6)
-    yaw = Rotation.from_quat(state[6:10], scalar_first=True).as_euler("ZYX")[0]
-    assert yaw == pytest.approx(-1.0, abs=1e-3)
+    yaw = Rotation.from_quat(link.out("state")[6:10], scalar_first=True).as_euler("ZYX")[0]
+    assert (link.out("state")[0], yaw) == pytest.approx((1.0, -1.0), abs=1e-3)
 
 
 @pytest.mark.parametrize("back", [0.0, 0.5, 20.0])
@@ -122,24 +118,21 @@ def test_px4_may_start_again_and_asks_for_the_time(link):
 
 @pytest.mark.parametrize("silence", [0.0, 1.5])
 def test_a_link_that_buffers_is_seen_in_the_age(link, silence):
-    for _ in range(20):
-        link.send_state()
-        link.advance(0.02)
-    link.advance(silence)
-    for _ in range(20):
-        link.send_state(0.1)
-        link.advance(0.02)
+    for late, pause in ((0.0, silence), (0.1, 0.0)):
+        for _ in range(20):
+            link.send_state(late)
+            link.advance(0.02)
+        link.advance(pause)
     assert link.out("age") == pytest.approx(0.12, abs=2e-3)
 
 
 def test_a_link_that_is_slow_from_the_start_is_seen_by_answers(link):
     waiting = []
     for _ in range(100):
-        waiting += [
-            (link.now + 0.07, dialect.MAVLink_timesync_message(round(1e9 * at), message.ts1))
-            for message in link.advance(0.01)
-            for at in [link.boot_time + 0.03]
-        ]
+        for message in link.advance(0.01):
+            at = round(1e9 * (link.boot_time + 0.03))
+            answer = dialect.MAVLink_timesync_message(at, message.ts1)
+            waiting.append((link.now + 0.07, answer))
         link.send_state(0.04)
         while waiting and waiting[0][0] <= link.now + 1e-6:
             link.send(waiting.pop(0)[1])
@@ -156,17 +149,16 @@ def test_a_process_that_is_behind_takes_no_message_for_faster():
 
 
 def test_granted_commands_are_remembered(link):
-    link.advance(0.02)
-    assert link.out("granted").tolist() == [0, 0]
-    link.send(dialect.MAVLink_command_ack_message(176, dialect.MAV_RESULT_ACCEPTED))
-    link.send(dialect.MAVLink_command_ack_message(400, dialect.MAV_RESULT_DENIED))
-    accepted = 400, dialect.MAV_RESULT_ACCEPTED
-    link.send(dialect.MAVLink_command_ack_message(*accepted, 0, 0, 1, 190))  # Of another process.
-    link.advance(0.02)
-    assert link.out("granted").tolist() == [1, 0]
-    link.send(dialect.MAVLink_command_ack_message(*accepted, 0, 0, 1, 191))
-    link.advance(0.02)
-    assert link.out("granted").tolist() == [1, 1]
+    accepted, denied = dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_DENIED
+    others = (400, accepted, 0, 0, 1, 190)  # of another process
+    for answers, granted in (
+        ([], [0, 0]),
+        ([(176, accepted), (400, denied), others], [1, 0]),
+        ([(400, accepted, 0, 0, 1, 191)], [1, 1]),
+    ):
+        link.send(*(dialect.MAVLink_command_ack_message(*answer) for answer in answers))
+        link.advance(0.02)
+        assert link.out("granted").tolist() == granted
 
 
 def test_refusals_and_warnings_of_px4_are_logged_once(link, caplog):
