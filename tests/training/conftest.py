@@ -1,13 +1,41 @@
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from splatpilot.diagrams.worlds.scene_folder import (
+    read_scene_metadata,
+    write_scene_folder,
+    write_scene_metadata,
+)
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Capsule, HalfSpace
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.corpus import collect
 from splatpilot.training.corpus.corpus import Corpus, CorpusConfig
 from splatpilot.training.corpus.expert import ExpertConfig
 from splatpilot.training.corpus.library import LibraryConfig
+
+
+@pytest.fixture(scope="session")
+def write_scene() -> Callable[..., str]:
+    """Writes a captured yard of 12 x 7 x 4 m with a post, which may have the name of a test scene."""
+    shapes = [HalfSpace([0, 0, 1], 0.0), Capsule([6.0, 3.5, 0.0], [6.0, 3.5, 5.0], 0.5)]
+    field = AnalyticDistanceField(shapes, np.zeros(3), np.array([12.0, 7.0, 4.0]))
+    esdf, one = esdf_from_distance_field(field, 0.2), np.ones((1, 3))
+    gaussians = GaussianScene.from_colors(one, [[1, 0, 0, 0]], one, [0.5], one)
+    world = World("hospital", gaussians, esdf, esdf, (0.0, 0.0, 0.0), one[0], 2 * one[0])
+
+    def write(path: Path, bound=None, split="train", digest=("0123456789abcdef",)) -> str:
+        write_scene_folder(path, world, provenance="", split=split, source_digest=digest)
+        write_scene_metadata(path, replace(read_scene_metadata(path), perturbation_bound=bound))
+        return str(path)
+
+    return write
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -6,16 +5,8 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.diagrams.worlds.inserted import InsertedConfig
-from splatpilot.diagrams.worlds.scene_folder import (
-    read_scene_metadata,
-    write_scene_folder,
-    write_scene_metadata,
-)
 from splatpilot.diagrams.worlds.splits import load_test_sources
-from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.common.provenance import SEEDS_PER_RUN, TRAINING_SEEDS, VALIDATION_SEEDS
-from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.corpus.library import (
     LibraryConfig,
     PerturbationConfig,
@@ -23,16 +14,6 @@ from splatpilot.training.corpus.library import (
     scenario_world,
     world_source,
 )
-
-
-def write_scene(path, bound, name="attic", split="train", digest=("0123456789abcdef",)):
-    free, one = np.zeros((10, 10, 10), bool), np.ones((1, 3))
-    esdf = esdf_from_occupancy(free, free, np.zeros(3), 0.3)
-    gaussians = GaussianScene.from_colors(one, [[1, 0, 0, 0]], one, [0.5], one)
-    world = World(name, gaussians, esdf, esdf, (0.0, 0.0, 0.0), one[0], 2 * one[0])
-    write_scene_folder(path, world, provenance="a test", split=split, source_digest=digest)
-    write_scene_metadata(path, replace(read_scene_metadata(path), perturbation_bound=bound))
-    return str(path)
 
 
 def test_seeds_are_those_of_training_or_validation_and_never_shared():
@@ -49,7 +30,7 @@ def test_seeds_are_those_of_training_or_validation_and_never_shared():
             world_source(LibraryConfig(), 0, index)
 
 
-def test_kinds_and_scenes_come_in_turn(tmp_path):
+def test_kinds_and_scenes_come_in_turn(tmp_path, write_scene):
     scene = write_scene(tmp_path / "attic", 0.25)
     library = LibraryConfig(kinds=["P02", "P06"], scenes=[scene])
     library.validate()
@@ -84,16 +65,18 @@ HOSPITAL = load_test_sources()["hospital"][3:5]
         ({}, {"kinds": ["P99"]}, "there is no scenario 'P99'"),
     ],
 )
-def test_invalid_libraries_are_refused(tmp_path, scene, library, message):
+def test_invalid_libraries_are_refused(tmp_path, write_scene, scene, library, message):
     path = write_scene(tmp_path / "attic", **{"bound": 0.2} | scene)
     scenes = [text.format(path) for text in library.get("scenes", ["{}"])]
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         LibraryConfig(**library | {"scenes": scenes}).validate()
 
 
-def test_copy_of_a_scene_that_the_benchmark_finds_here_is_not_learned_in(tmp_path, monkeypatch):
+def test_copies_of_scenes_that_the_benchmark_finds_are_not_learned_in(
+    tmp_path, write_scene, monkeypatch
+):
     monkeypatch.setenv("SPLATPILOT_SCENES", str(tmp_path))
-    scene = write_scene(tmp_path / "shop", 0.2, "hospital")  # a name of the benchmark is allowed
+    scene = write_scene(tmp_path / "shop", 0.2)
     LibraryConfig(kinds=[], scenes=[scene]).validate()
     write_scene(tmp_path / "bookstore", 0.2, split="test")
     with pytest.raises(ValueError, match="shop shows bookstore, in which the benchmark tests"):

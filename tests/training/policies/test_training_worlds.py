@@ -6,15 +6,12 @@ import pytest
 import torch
 
 from splatpilot.diagrams.worlds import splits
-from splatpilot.diagrams.worlds.scene_folder import SceneConfig, write_scene_folder
+from splatpilot.diagrams.worlds.scene_folder import SceneConfig
 from splatpilot.diagrams.worlds.splits import part_digests, source_digest
-from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import AnalyticDistanceField, Capsule, HalfSpace
+from splatpilot.systems.collision.shapes import Capsule, HalfSpace
 from splatpilot.systems.common.files import cache_folder
-from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.corpus.library import scenario_world
 from splatpilot.training.policies import training_worlds as world_cache
@@ -32,20 +29,9 @@ from splatpilot.training.policies.training_worlds import (
 UPPER = np.array([12.0, 7.0, 4.0])
 
 
-def write_yard(folder: Path, split: str = "train") -> str:
-    """A captured yard with a post in it."""
-    shapes = [HalfSpace([0, 0, 1], 0.0), Capsule([6.0, 3.5, 0.0], [6.0, 3.5, 5.0], 0.5)]
-    esdf = esdf_from_distance_field(AnalyticDistanceField(shapes, np.zeros(3), UPPER), 0.2)
-    one, digest = np.ones((1, 3)), ["0123456789abcdef"]
-    gaussians = GaussianScene.from_colors(one, [[1, 0, 0, 0]], one, [0.5], one)
-    world = World(folder.name, gaussians, esdf, esdf, (0.0, 0.0, 0.0), one[0], 2 * one[0])
-    write_scene_folder(folder, world, provenance="", split=split, source_digest=digest)
-    return str(folder)
-
-
 @pytest.fixture(scope="module")
-def yard(tmp_path_factory) -> str:
-    return write_yard(tmp_path_factory.mktemp("scenes") / "yard")
+def yard(write_scene, tmp_path_factory) -> str:
+    return write_scene(tmp_path_factory.mktemp("scenes") / "yard")
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +99,7 @@ def test_policies_learn_in_scenes(worlds):
         assert all(g is not None and g.isfinite().all() and g.any() for g in gradients)
 
 
-def test_bad_selections_are_refused(tmp_path, monkeypatch):
+def test_bad_selections_are_refused(tmp_path, write_scene, monkeypatch):
     map_file = tmp_path / "renamed.bt"
     map_file.write_bytes(b"a map")
     # Other scenarios than the benchmark's are kinds.
@@ -121,7 +107,7 @@ def test_bad_selections_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(
         splits, "load_test_sources", lambda: {"lab": source_digest(part_digests([b"a map"]))}
     )
-    tested = write_yard(tmp_path / "warehouse", "test")
+    tested = write_scene(tmp_path / "warehouse", split="test")
     for fields, message in (
         ({"kinds": ["R13"]}, "worlds.kinds must be of generated worlds, got R13"),
         ({"scenes": [tested]}, "split of .*warehouse must be train, got 'test'"),

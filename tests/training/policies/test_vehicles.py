@@ -1,12 +1,14 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import ConstantVectorSource
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
 from random_scenes import normal_tensor
 
-from splatpilot.systems.policies.agile_autonomy import FOV_X
 from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import (
@@ -29,13 +31,7 @@ from splatpilot.training.policies.train_agile_autonomy import (
     AgileAutonomyTraining,
 )
 from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds
-from splatpilot.training.policies.vehicles import (
-    CAMERA_AHEAD,
-    BodyRate,
-    History,
-    PointMass,
-    map_tensors,
-)
+from splatpilot.training.policies.vehicles import BodyRate, History, PointMass, map_tensors
 
 CONTROL = FlatnessControllerConfig()
 
@@ -99,16 +95,6 @@ SELECTION = WorldSelection(kinds=["P02"], count=1, voxel_size=0.5)
 TWO_STEPS = ObservationNoise(latency=2 * PERIOD)
 
 
-class Wandering(LeafSystem):
-    def __init__(self, states: np.ndarray) -> None:
-        super().__init__()
-        self._states = states
-        self.DeclareVectorOutputPort("state", 13, self._calc)
-
-    def _calc(self, context, output) -> None:
-        output.set_value(self._states[round(context.get_time() / PERIOD)])
-
-
 STREAM = ObservationNoise(latency=0.05, frame_rate=[10.0, 30.0], jitter=0.04, frame_dropout=0.2)
 
 
@@ -120,7 +106,8 @@ def test_past_is_what_delayed_pose_gives(noise):
     states = np.cumsum(np.random.default_rng(0).normal(scale=0.1, size=(8, 13)), axis=0)
     states[:, 6] += 1.0
     builder = DiagramBuilder()
-    source = builder.AddSystem(Wandering(states))
+    wandering = PiecewisePolynomial.FirstOrderHold(PERIOD * np.arange(8), states.T)
+    source = builder.AddSystem(TrajectorySource(wandering))
     system = builder.AddSystem(DelayedPose(times, PERIOD))
     builder.Connect(source.get_output_port(), system.GetInputPort("state"))
     simulator = Simulator(builder.Build())
@@ -208,10 +195,8 @@ def test_imitation_has_late_images():
     )
     trainer = AgileAutonomyTrainer(config)
     trainer.begin_update(0)
-    data, spec = trainer.state_dict()["data"], trainer.spec
-    x, y, z = data["R_WB"].unbind(2)
-    p_WC, R_WC = data["p_WB"] + CAMERA_AHEAD * x, torch.stack([-y, -z, x], 2)
-    rays = PixelRays.of(spec.image_width, spec.image_height, FOV_X)
-    geometry = training_worlds(selection, 0).geometry
-    depth = geometry.depth(p_WC, R_WC, rays, torch.zeros(6).long())[[0, 0, 0, 1, 2, 3]]
+    data, geometry = trainer.state_dict()["data"], training_worlds(selection, 0).geometry
+    vehicle = SimpleNamespace(p=data["p_WB"], attitude=lambda: data["R_WB"])
+    depth = render_depth(vehicle, geometry, trainer.agent.rays, torch.zeros(6).long())
+    depth = depth[[0, 0, 0, 1, 2, 3]]
     torch.testing.assert_close(data["depth"], depth.half(), rtol=2e-3, atol=0)
