@@ -17,8 +17,14 @@ from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.readers import readable, require_readable_size
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.packed_splats import Arrays, moved
-from splatpilot.systems.splats.scene import MAX_DEGREE, GaussianScene, color_to_sh, concatenated
+from splatpilot.systems.splats.packed_splats import Arrays
+from splatpilot.systems.splats.scene import (
+    MAX_DEGREE,
+    GaussianScene,
+    color_to_sh,
+    concatenated,
+    rotated_sh,
+)
 
 _EXTENSION = "KHR_gaussian_splatting"
 _HARMONICS = [f"SH_DEGREE_{d}_COEF_{n}" for d in range(MAX_DEGREE + 1) for n in range(2 * d + 1)]
@@ -46,12 +52,34 @@ def unpack_gltf(path: Path) -> Arrays:
     file = _Buffers(path, document, body)
     with readable(path, f"glTF file of {_EXTENSION}"):
         parts = [
-            moved(_unpack_primitive(file, primitive), X)
+            _moved(_unpack_primitive(file, primitive), X)
             for X, mesh in _placed_meshes(document)
             for primitive in document["meshes"][mesh]["primitives"]
             if _EXTENSION in primitive.get("extensions", {})
         ]
         return concatenated(parts)
+
+
+def _moved(arrays: Arrays, X: NDArray[np.float64]) -> Arrays:
+    """Returns Gaussians under an affine transform (4, 4) that does not mirror."""
+    M = X[:3, :3]
+    if np.array_equal(X, np.eye(4)):
+        return arrays
+    require(np.linalg.det(M) > 0, "a transform of Gaussians", "one without mirroring", M.tolist())
+    U, stretch, V = np.linalg.svd(M)
+    turn, quats, scales = U @ V, arrays["quats"], arrays["scales"]
+    known = np.isfinite(quats).all(axis=1) & quats.any(axis=1) & np.isfinite(scales).all(axis=1)
+    R, sizes = Rotation.from_quat(quats[known], scalar_first=True).as_matrix(), scales[known]
+    if np.ptp(stretch) < 1e-5 * stretch[0]:
+        R, sizes = turn @ R, stretch.mean() * sizes
+    else:
+        R, sizes, _ = np.linalg.svd(M @ (R * sizes[:, None, :]))
+        R[:, :, 2] *= np.linalg.det(R)[:, None]
+    # Invalid ones are dropped later.
+    quats, scales = (np.full(array.shape, np.nan) for array in (quats, scales))
+    quats[known], scales[known] = Rotation.from_matrix(R).as_quat(scalar_first=True), sizes
+    means, sh = arrays["means"] @ M.T + X[:3, 3], rotated_sh(arrays["sh"], turn)
+    return arrays | {"means": means, "quats": quats, "scales": scales, "sh": sh}
 
 
 def _open(content: bytes) -> tuple[dict[str, Any], bytes]:
@@ -227,7 +255,7 @@ def unpack_usd(path: Path) -> tuple[Arrays, float, bool]:
         parts = []
         for prim in found:
             X = np.array(transforms.GetLocalToWorldTransform(prim)).T  # USD's vectors are rows
-            parts.append(moved(_unpack_prim(prim, first), X))
+            parts.append(_moved(_unpack_prim(prim, first), X))
         meters = float(UsdGeom.GetStageMetersPerUnit(stage))
         return concatenated(parts), meters, UsdGeom.GetStageUpAxis(stage) == "Y"
 

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from plyfile import PlyData, PlyElement
-from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.readers import read_text, readable, require_readable_size
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.scene import color_to_sh, rotated_sh
+from splatpilot.systems.splats.scene import color_to_sh
 
 type Arrays = dict[str, NDArray[Any]]
 """The arrays of `GaussianScene`, in its order, as a file holds them, not checked yet."""
@@ -35,28 +34,6 @@ def insert_largest(small: NDArray, index: NDArray) -> NDArray[np.float64]:
     largest = np.sqrt(np.maximum(1 - (small**2).sum(axis=1, keepdims=True), 0))
     np.put_along_axis(quats, index[:, None], largest, axis=1)
     return quats
-
-
-def moved(arrays: Arrays, X: NDArray[np.float64]) -> Arrays:
-    """Returns Gaussians under an affine transform (4, 4) that does not mirror."""
-    M = X[:3, :3]
-    if np.array_equal(X, np.eye(4)):
-        return arrays
-    require(np.linalg.det(M) > 0, "a transform of Gaussians", "one without mirroring", M.tolist())
-    U, stretch, V = np.linalg.svd(M)
-    turn, quats, scales = U @ V, arrays["quats"], arrays["scales"]
-    known = np.isfinite(quats).all(axis=1) & quats.any(axis=1) & np.isfinite(scales).all(axis=1)
-    R, sizes = Rotation.from_quat(quats[known], scalar_first=True).as_matrix(), scales[known]
-    if np.ptp(stretch) < 1e-5 * stretch[0]:
-        R, sizes = turn @ R, stretch.mean() * sizes
-    else:
-        R, sizes, _ = np.linalg.svd(M @ (R * sizes[:, None, :]))
-        R[:, :, 2] *= np.linalg.det(R)[:, None]
-    # Invalid ones are dropped later.
-    quats, scales = (np.full(array.shape, np.nan) for array in (quats, scales))
-    quats[known], scales[known] = Rotation.from_matrix(R).as_quat(scalar_first=True), sizes
-    means, sh = arrays["means"] @ M.T + X[:3, 3], rotated_sh(arrays["sh"], turn)
-    return arrays | {"means": means, "quats": quats, "scales": scales, "sh": sh}
 
 
 # PlayCanvas's compressed PLY: vertices are four words of 32 bits. Each 256 share a row of the

@@ -65,29 +65,22 @@ def harmonic_degree(coefficients: int) -> int:
     return counts.index(coefficients)
 
 
-def sh_rotations(R: ArrayLike, degree: int) -> list[NDArray[np.float64]]:
-    """Returns, for l = 0 to `degree`, the (2l+1, 2l+1) matrix M that rotates degree-l coefficients.
+def rotated_sh(sh: NDArray, R_WO: ArrayLike) -> NDArray[np.float64]:
+    """Returns coefficients (N, K, 3) for directions in W, f_W(d_W) = f_O(R^T d_W), of those in O.
 
-    M c are the coefficients of f_W(d_W) = f_O(R^T d_W), with `R` = R_WO (3, 3) and c those of f_O.
-    Samples of the basis in 2l + 1 or more directions determine M exactly.
+    Samples of the basis in 2l + 1 or more directions determine the matrix of degree l exactly.
     """
-    R = np.asarray(R, dtype=np.float64)
     count = 32  # spread directions; 7 would do, more condition the solve
     z = (np.arange(count) + 0.5) / count * 2 - 1
     azimuth = np.arange(count) * np.pi * (3 - np.sqrt(5))
     ring = np.sqrt(1 - z * z)
     d_W = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=-1)
+    degree, rotated = harmonic_degree(sh.shape[1]), np.empty(sh.shape)
     basis_W = sh_basis(d_W, degree)
-    basis_O = sh_basis(d_W @ R, degree)  # rows (R^T d)^T
-    bands = [slice(l * l, (l + 1) ** 2) for l in range(degree + 1)]  # noqa: E741
-    return [np.linalg.lstsq(basis_W[:, b], basis_O[:, b], rcond=None)[0] for b in bands]
-
-
-def rotated_sh(sh: NDArray, R_WO: ArrayLike) -> NDArray[np.float64]:
-    """Returns coefficients (N, K, 3) of colors in frame O for directions in W."""
-    rotated = np.empty(sh.shape)
-    for l, matrix in enumerate(sh_rotations(R_WO, harmonic_degree(sh.shape[1]))):  # noqa: E741
+    basis_O = sh_basis(d_W @ np.asarray(R_WO, dtype=np.float64), degree)  # rows (R^T d)^T
+    for l in range(degree + 1):  # noqa: E741
         band = slice(l * l, (l + 1) ** 2)
+        matrix = np.linalg.lstsq(basis_W[:, band], basis_O[:, band], rcond=None)[0]
         rotated[:, band] = np.einsum("jk,nkc->njc", matrix, sh[:, band])
     return rotated
 
