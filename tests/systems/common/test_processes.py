@@ -78,21 +78,22 @@ def test_processes_end_with_a_parent_that_is_killed(tmp_path):
         time.sleep(0.1)
 
 
-def _work(work):
-    if work == "abort":
+def _work(error):
+    if error is None:
         os.abort()
-    if work == "count":
-        return os.getpid()
-    raise {"refuse": ValueError, "fail": RuntimeError}[work]("no factory")
+    raise error("no factory")
 
 
 def test_work_in_a_subprocess():
-    assert run_in_subprocess("a: counting", _work, "count") != os.getpid()
-    with pytest.raises(ValueError, match="no factory"):
-        run_in_subprocess("a: counting", _work, "refuse")
-    for work, why in (("abort", "its process was ended"), ("fail", "no factory")):
-        with pytest.raises(OSError, match=f"a: counting: {why}, perhaps out of disk space"):
-            run_in_subprocess("a: counting", _work, work)
+    assert run_in_subprocess("a: counting", _square, 3)[1] != os.getpid()
+    message = "a: counting: {}, perhaps out of disk space"
+    for given, error, told in (
+        (ValueError, ValueError, "no factory"),
+        (RuntimeError, OSError, message.format("no factory")),
+        (None, OSError, message.format("its process was ended")),
+    ):
+        with pytest.raises(error, match=told):
+            run_in_subprocess("a: counting", _work, given)
 
 
 def test_cores_are_those_that_the_process_may_use(monkeypatch):
