@@ -17,6 +17,8 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import lcm
@@ -40,33 +42,30 @@ PERIOD = 20.0  # [ms], of regular messages
 PROGRAM = [sys.executable, "-c", "from splatpilot.analysis.commands.main import run; run()"]
 
 
-class Listener:
-    """Records sequence number, utime [s] and arrival [s] of messages, in a thread."""
+@contextmanager
+def listening(url: str) -> Iterator[dict[str, list[tuple[int, float, float]]]]:
+    """Yields sequence number, utime [s] and arrival [s] of messages, which a thread records."""
+    heard, over = collections.defaultdict(list), threading.Event()
 
-    def __init__(self, url: str):
-        self._lcm = lcm.LCM(url)
-        self.heard: dict[str, list[tuple[int, float, float]]] = collections.defaultdict(list)
-        for channel in TYPES:
-            self._lcm.subscribe(channel, self._hear).set_queue_capacity(10_000)
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._listen)
-
-    def __enter__(self) -> "Listener":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
-
-    def _listen(self) -> None:
-        while not self._over.is_set():
-            self._lcm.handle_timeout(100)
-
-    def _hear(self, channel: str, data: bytes) -> None:
+    def hear(channel: str, data: bytes) -> None:
         now = time.time()
         stamp = TYPES[channel].decode(data).header
-        self.heard[channel].append((stamp.seq, 1e-6 * stamp.utime, now))
+        heard[channel].append((stamp.seq, 1e-6 * stamp.utime, now))
+
+    def listen() -> None:
+        while not over.is_set():
+            connection.handle_timeout(100)
+
+    connection = lcm.LCM(url)
+    for channel in TYPES:
+        connection.subscribe(channel, hear).set_queue_capacity(10_000)
+    thread = threading.Thread(target=listen)
+    thread.start()
+    try:
+        yield heard
+    finally:
+        over.set()
+        thread.join()
 
 
 def row(*cells: object) -> None:
@@ -114,9 +113,9 @@ def main() -> None:
     loops: list[np.ndarray] = []
     with tempfile.TemporaryDirectory() as root:
         for seed in range(seeds):
-            with Listener(url) as listener:
+            with listening(url) as messages:
                 outcomes.append(fly([*options, "--seed", str(seed)], Path(root) / str(seed)))
-            heard = {name: np.array(values) for name, values in listener.heard.items()}
+            heard = {name: np.array(values) for name, values in messages.items()}
             first, last = heard["BODY_RATE_COMMAND"][[0, -1], 2]  # while both processes run
             for name, values in heard.items():
                 values = values[(values[:, 2] >= first) & (values[:, 2] <= last)]

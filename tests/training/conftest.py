@@ -23,7 +23,7 @@ from splatpilot.training.corpus.library import LibraryConfig
 
 @pytest.fixture(scope="session")
 def write_scene() -> Callable[..., str]:
-    """Writes a captured yard of 12 x 7 x 4 m with a post, which may have the name of a test scene."""
+    """Writes a yard of 12 x 7 x 4 m with a post, named as a test scene is; returns its path."""
     shapes = [HalfSpace([0, 0, 1], 0.0), Capsule([6.0, 3.5, 0.0], [6.0, 3.5, 5.0], 0.5)]
     field = AnalyticDistanceField(shapes, np.zeros(3), np.array([12.0, 7.0, 4.0]))
     esdf, one = esdf_from_distance_field(field, 0.2), np.ones((1, 3))

@@ -10,11 +10,9 @@ from splatpilot import Config, QuadrotorState, bounded, register_policy
 
 
 def _rangefinders() -> dict[str, RangefinderConfig]:
-    return {
-        # Tilted, to see edges that the vehicle itself would not clear.
-        "ahead": RangefinderConfig(direction=[1.0, 0.0, -0.3]),
-        "below": RangefinderConfig(direction=[0.0, 0.0, -1.0]),
-    }
+    # The first is tilted, to see edges that the vehicle itself would not clear.
+    directions = {"ahead": [1.0, 0.0, -0.3], "below": [0.0, 0.0, -1.0]}
+    return {name: RangefinderConfig(direction) for name, direction in directions.items()}
 
 
 @dataclass
@@ -51,27 +49,20 @@ class Climber(LeafSystem):
     .. pydrake_system::
 
         name: Climber
-        input_ports:
-        - state
-        - goal
-        - ahead_distance
-        - below_distance
-        output_ports:
-        - acceleration
+        input_ports: [state, goal, ahead_distance, below_distance]
+        output_ports: [acceleration]
 
     Updates at `rate` from time 0 with the acceleration to `desired_velocity`.
     """
 
-    def __init__(self, config: ClimberConfig | None = None):
+    def __init__(self, config: ClimberConfig):
         super().__init__()
-        self._config = config or ClimberConfig()
-        self._config.validate()
-        self.sensors = self._config.sensors
+        self._config, self.sensors = config, config.sensors
         ports = {"state": 13, "goal": 3, "ahead_distance": 1, "below_distance": 1}
         for name, size in ports.items():
             self.DeclareVectorInputPort(name, size)
         self.DeclareStateOutputPort("acceleration", self.DeclareDiscreteState(3))
-        self.DeclarePeriodicDiscreteUpdateEvent(1 / self._config.rate, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(1 / config.rate, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state, p_WG, ahead, below = (

@@ -1,6 +1,7 @@
 """A capture format: the log of a drone that takes photographs in flight."""
 
 import csv
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -44,12 +45,9 @@ def read_flight_log(path: Path, config: CaptureConfig) -> Capture:
 
         return FrameFiles(path / row["image"], pose)
 
-    def lens(width: int, height: int) -> Lens:
-        return Lens(K, width, height)
-
     with file.open(newline="") as stream:
         frames = [frame(row, line) for line, row in enumerate(csv.DictReader(stream), start=2)]
-    return open_frames(path, "flight log", frames, axes=_AXES, lens=lens)
+    return open_frames(path, "flight log", frames, axes=_AXES, lens=partial(Lens, K))
 
 
 FLIGHT_LOG = register_capture("flight_log", is_flight_log, read_flight_log)

@@ -7,7 +7,7 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from splatpilot import Config, Scenario, World, bounded, register_sensor
+from splatpilot import Config, bounded, register_sensor
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.common.validation import require_field
 from splatpilot.systems.sensing.imu import cast_ray
@@ -33,10 +33,8 @@ class Rangefinder(LeafSystem):
     .. pydrake_system::
 
         name: Rangefinder
-        input_ports:
-        - body_pose
-        output_ports:
-        - distance
+        input_ports: [body_pose]
+        output_ports: [distance]
 
     - ``body_pose``: X_WB.
     - ``distance`` (1): [m] to the nearest surface of the distance field along the ray.
@@ -44,7 +42,6 @@ class Rangefinder(LeafSystem):
 
     def __init__(self, config: RangefinderConfig, distance_field: DistanceField):
         super().__init__()
-        config.validate()
         self._far, self._field = config.max_range, distance_field
         self._e_L = np.array(config.direction) / np.linalg.norm(config.direction)
         self.DeclareAbstractInputPort("body_pose", Value(RigidTransform()))
@@ -58,8 +55,6 @@ class Rangefinder(LeafSystem):
         output.SetAtIndex(0, min(distance, self._far))
 
 
-def _build(config: RangefinderConfig, world: World, scenario: Scenario) -> Rangefinder:
-    return Rangefinder(config, world.distance_field)
-
-
-register_sensor(RangefinderConfig, _build)
+register_sensor(
+    RangefinderConfig, lambda config, world, _: Rangefinder(config, world.distance_field)
+)
