@@ -141,22 +141,14 @@ def _leaves(masks: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarra
     corner[0] = -(2 ** (_DEPTH - 1))
     level = np.zeros(len(masks), dtype=np.int64)
     bits = np.array([0, 1, 2])
-    of_level = np.array([0])
-    by_parent = 1 + np.argsort(parent[1:], kind="stable")
+    nodes = np.array([0])
     for depth in range(1, _DEPTH):
-        first = np.searchsorted(parent[by_parent], of_level, "left")
-        last = np.searchsorted(parent[by_parent], of_level, "right")
-        counts = last - first
-        if not counts.any():
-            break
-        of_level = by_parent[
-            np.repeat(first - np.concatenate([[0], counts.cumsum()[:-1]]), counts)
-            + np.arange(counts.sum())
-        ]
-        level[of_level] = depth
-        half = 2 ** (_DEPTH - depth)
-        step = half * (number[of_level, None] >> bits & 1)
-        corner[of_level] = corner[parent[of_level]] + step
+        of_level = np.zeros(len(masks), dtype=bool)
+        of_level[nodes] = True
+        nodes = 1 + np.flatnonzero(of_level[parent[1:]])
+        level[nodes] = depth
+        step = 2 ** (_DEPTH - depth) * (number[nodes, None] >> bits & 1)
+        corner[nodes] = corner[parent[nodes]] + step
     child = masks[:, None] >> (2 * np.arange(8)) & 3  # (inner nodes, 8)
     node, octant = np.nonzero((child == _FREE) | (child == _OCCUPIED))
     size = 2 ** (_DEPTH - 1 - level[node])
