@@ -17,35 +17,33 @@ from splatpilot.systems.common.processes import (
 )
 
 
-def _square(number: int) -> tuple[int, int]:
-    return number * number, os.getpid()
-
-
-def _killed(folder: Path) -> str:
-    """Kills its process on the first call for a folder."""
-    try:
-        (folder / "mark").touch(exist_ok=False)
-    except FileExistsError:
-        return "ended"
-    os.kill(os.getpid(), signal.SIGKILL)
-    return "never"
-
-
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_results_are_those_of_the_function_and_may_be_given_up(jobs, recwarn):
-    results = list(map_processes(_square, range(7), jobs))
+    def square(number: int) -> tuple[int, int]:  # Workers need not import this module for it.
+        return number * number, os.getpid()
+
+    results = list(map_processes(square, range(7), jobs))
     assert sorted(square for square, _ in results) == [n * n for n in range(7)]
     assert ({pid for _, pid in results} == {os.getpid()}) == (jobs == 1)
-    given_up = map_processes(_square, range(20), jobs)
+    given_up = map_processes(square, range(20), jobs)
     assert next(given_up)[0] in [n * n for n in range(20)]
     given_up.close()
     assert not recwarn.list
 
 
 def test_killed_process_is_named_and_the_next_call_works(tmp_path):
+    def killed(folder: Path) -> str:
+        """Kills its process on the first call for a folder."""
+        try:
+            (folder / "mark").touch(exist_ok=False)
+        except FileExistsError:
+            return "ended"
+        os.kill(os.getpid(), signal.SIGKILL)
+        return "never"
+
     with pytest.raises(OSError, match=r"was killed.*run the same command again, with fewer --jobs"):
-        list(map_processes(_killed, [tmp_path] * 3, jobs=2))
-    assert list(map_processes(_killed, [tmp_path] * 3, jobs=2)) == ["ended"] * 3
+        list(map_processes(killed, [tmp_path] * 3, jobs=2))
+    assert list(map_processes(killed, [tmp_path] * 3, jobs=2)) == ["ended"] * 3
 
 
 def _is_running(pid: int) -> bool:
@@ -78,14 +76,13 @@ def test_processes_end_with_a_parent_that_is_killed(tmp_path):
         time.sleep(0.1)
 
 
-def _work(error):
-    if error is None:
-        os.abort()
-    raise error("no factory")
-
-
 def test_work_in_a_subprocess():
-    assert run_in_subprocess("a: counting", _square, 3)[1] != os.getpid()
+    def work(error):
+        if error is None:
+            os.abort()
+        raise error("no factory")
+
+    assert run_in_subprocess("a: counting", lambda _: os.getpid(), 3) != os.getpid()
     message = "a: counting: {}, perhaps out of disk space"
     for given, error, told in (
         (ValueError, ValueError, "no factory"),
@@ -93,7 +90,7 @@ def test_work_in_a_subprocess():
         (None, OSError, message.format("its process was ended")),
     ):
         with pytest.raises(error, match=told):
-            run_in_subprocess("a: counting", _work, given)
+            run_in_subprocess("a: counting", work, given)
 
 
 def test_cores_are_those_that_the_process_may_use(monkeypatch):
