@@ -40,9 +40,8 @@ class ArrivalTriggered(LeafSystem):
 
     It runs no more often than at the system's rate: it skips some of faster images, by virtual
     scheduling (ITU-T I.371, the generic cell rate algorithm), and runs without an image 1.6
-    periods after the last update. A system without state, whose outputs are evaluated as they are
-    needed, counts as updated by each observation. An exception of the system is logged, once until
-    the system succeeds again, and its state is kept.
+    periods after the last update. Each observation counts as an update of a system without state.
+    An exception is logged, once until the system succeeds again, and the state is kept.
 
     .. pydrake_system::
 
@@ -102,9 +101,8 @@ class ArrivalTriggered(LeafSystem):
         for group in range(inner.num_discrete_state_groups()):
             inner.SetDiscreteState(group, context.get_discrete_state(group).value())
         for index in inputs:
-            if self.get_input_port(index).HasValue(context):
-                value = self.get_input_port(index).Eval(context)
-                self._system.get_input_port(index).FixValue(inner, value)
+            if (port := self.get_input_port(index)).HasValue(context):
+                self._system.get_input_port(index).FixValue(inner, port.Eval(context))
         return inner
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -125,20 +123,16 @@ class ArrivalTriggered(LeafSystem):
         """Updates the system's state; returns False, and logs why, if it raises an exception."""
         inner = self._inner(context, list(range(self._system.num_input_ports())))
         try:
-            values = []
             if self._period > 0.0:
-                updated = self._system.EvalUniquePeriodicDiscreteUpdate(inner)
-                values = [updated.value(k) for k in range(inner.num_discrete_state_groups())]
-            for group, value in enumerate(values):
-                inner.SetDiscreteState(group, value)
+                inner.SetDiscreteState(self._system.EvalUniquePeriodicDiscreteUpdate(inner))
             for index in range(self._system.num_output_ports()):
                 self._system.get_output_port(index).Eval(inner)
         except Exception:
             if not self._get_last(context).failed:
                 _log.exception("the policy %s failed", type(self._system).__name__)
             return False
-        for group, value in enumerate(values):
-            discrete_state.set_value(group, value)
+        for group in range(inner.num_discrete_state_groups()):
+            discrete_state.set_value(group, inner.get_discrete_state(group).value())
         return True
 
     def _get_last(self, context: Context) -> _Last:
