@@ -135,7 +135,7 @@ def run(*, config: Px4Config, duration: float = np.inf, log: Path | None = None)
     of PX4's mode, and every ten seconds how long there has been no heartbeat. Replays a `log` of
     PX4 in real time instead, if given, and prints `replay_report`."""
     config.validate()
-    lcm, epoch = open_lcm(config.url), time.time() - time.monotonic()
+    lcm, epoch, commander = open_lcm(config.url), time.time() - time.monotonic(), config.commander
     inbox = LogInbox(log, config.system, time.monotonic) if log else UdpInbox(config.udp)
     with contextlib.closing(inbox):
         diagram = BuildPx4Diagram(config, lcm, inbox, now=lambda: epoch + time.monotonic())
@@ -143,9 +143,8 @@ def run(*, config: Px4Config, duration: float = np.inf, log: Path | None = None)
         root = simulator.get_context()
         address = str(log) if log else f"{config.udp.host}:{inbox.port}"
         print(f"PX4's packets come to {address}.", flush=True)
-        requests = {"Offboard mode": config.commander.engage, "Arming": config.commander.arm}
-        for name, requested in requests.items():
-            print(f"{name} is {'requested' if requested else 'left to the pilot'}.", flush=True)
+        for name, is_ours in (("Offboard mode", commander.engage), ("Arming", commander.arm)):
+            print(f"{name} is {'requested' if is_ours else 'left to the pilot'}.", flush=True)
         before, reminders, ages = "not heard", 0, []
 
         def say(text: str) -> None:

@@ -119,16 +119,12 @@ class _Telemetry(Received):
         moved, rotated = (predict_state(state, time - each.time) for each in (p, a))
         return np.append(moved[:6], rotated[6:])
 
-    def mode(self, now: float) -> tuple[bool, int, int]:
-        """Returns if PX4 is armed, and its mode; zeros if they are unknown at `now` [s]."""
-        is_known = now - self.heard <= HEARTBEAT_TIMEOUT
-        return (self.heartbeat.armed, *self.heartbeat.mode) if is_known else (False, 0, 0)
-
-    def status(self, now: float) -> list[float]:
-        """Returns the signal of `VehicleStatusCodec` at `now` [s]."""
-        if now - self.heard > HEARTBEAT_TIMEOUT:
-            return [math.nan, math.nan]
-        return [self.heartbeat.armed, self.heartbeat.mode[0] == mavlink.OFFBOARD[0]]
+    def mode(self, now: float) -> tuple[float, ...]:
+        """Returns if PX4 is armed, its mode, and the signal of `VehicleStatusCodec`; zeros and NaN
+        if they are unknown at `now` [s]."""
+        (armed, mode), is_known = self.heartbeat, now - self.heard <= HEARTBEAT_TIMEOUT
+        known = armed, *mode, armed, mode[0] == mavlink.OFFBOARD[0]
+        return known if is_known else (0, 0, 0, math.nan, math.nan)
 
 
 class Px4Telemetry(Receiver[_Telemetry]):
@@ -174,8 +170,8 @@ class Px4Telemetry(Receiver[_Telemetry]):
         self._declare("granted", 2, lambda got, _: [each in got.granted for each in commands])
         self._declare("heartbeat_age", 1, lambda got, now: now - got.heard, timed=True)
         self._declare("armed", 1, lambda got, now: got.mode(now)[0], timed=True)
-        self._declare("mode", 2, lambda got, now: got.mode(now)[1:], timed=True)
-        self._declare("vehicle_status", 2, _Telemetry.status, timed=True)
+        self._declare("mode", 2, lambda got, now: got.mode(now)[1:3], timed=True)
+        self._declare("vehicle_status", 2, lambda got, now: got.mode(now)[3:], timed=True)
         self.DeclarePeriodicPublishEvent(period, PUBLISH_OFFSET, self._answer)
         self.DeclarePeriodicPublishEvent(_QUESTION_PERIOD, PUBLISH_OFFSET, self._ask)
 
