@@ -108,8 +108,9 @@ class _Writer:
         self.frames = self.files = 0
         self.episodes: list[dict[str, Any]] = []
         self._columns: list[dict[str, np.ndarray]] = []
-        self._log_bounds = np.log(np.array([camera.min_depth, camera.max_depth]) + _SHIFT)
-        depths = np.exp(np.linspace(*self._log_bounds, _MAX_CODE + 1)) - _SHIFT
+        bounds = np.array([camera.min_depth, camera.max_depth])
+        near, far = self._log_bounds = np.log(bounds + _SHIFT)
+        depths = np.exp(np.linspace(near, far, _MAX_CODE + 1)) - _SHIFT
         self._values = {COLOR: np.arange(256) / 255, DEPTH: depths}  # of all codes
         self._totals = {COLOR: np.zeros((3, 256), int), DEPTH: np.zeros((1, _MAX_CODE + 1), int)}
 

@@ -40,6 +40,11 @@ def depth_noise() -> ObservationNoise:
     return ObservationNoise(depth_multiplicative=0.03, depth_additive=0.02, depth_dropout=0.01)
 
 
+def color_noise() -> ObservationNoise:
+    """Returns the default noise of training from RGB."""
+    return ObservationNoise(color_noise=0.02, brightness_jitter=0.2)
+
+
 def check_noise(
     noise: ObservationNoise, *, depth: bool = False, color: bool = False, time: bool
 ) -> None:

@@ -70,16 +70,17 @@ def export(weights: Path, out: Path) -> None:
         image = 3, checkpoint.spec.height, checkpoint.spec.width
     else:
         raise ValueError(f"{weights}: the policy {policy!r} has no export")
-    sizes, recurrent = [image, (network.state_layer.in_features,)], hasattr(network, "memory")
-    if recurrent:
+    sizes = [image, (network.state_layer.in_features,)]
+    if isinstance(network, TrainableNetwork):
         sizes.append((network.memory.hidden_size,))
+    outputs = ["output", "next_hidden"] if len(sizes) == 3 else ["waypoints", "costs"]
     with written_atomically(out) as partial:
         torch.onnx.export(
             module.eval(),
             tuple(torch.zeros(1, *size) for size in sizes),
             partial,
             input_names=["image", "state", "hidden"][: len(sizes)],
-            output_names=["output", "next_hidden"] if recurrent else ["waypoints", "costs"],
+            output_names=outputs,
             dynamo=True,
             external_data=False,
             verbose=False,

@@ -28,7 +28,7 @@ from splatpilot.systems.common.files import (
     write_text,
     written_atomically,
 )
-from splatpilot.systems.common.processes import available_cores, map_processes
+from splatpilot.systems.common.processes import map_processes
 from splatpilot.systems.common.progress import Progress, resumable, say
 from splatpilot.systems.common.provenance import InfeasibleFlightError, revision
 from splatpilot.systems.common.readers import read_archive
@@ -121,7 +121,7 @@ def rows_to_recover(flight: StudentFlight, events: np.ndarray, period: float) ->
     return rows[flight.clearances[rows] > 0.0]
 
 
-def add_recovery(folder: Path, flights: Sequence[StudentFlight], jobs: int | None = None) -> Corpus:
+def add_recovery(folder: Path, flights: Sequence[StudentFlight], jobs: int) -> Corpus:
     """Adds samples of recovery from flights to a corpus; flights that were added add nothing."""
     corpus = Corpus(folder)
     records = {record.name: record for record in corpus.worlds}
@@ -141,7 +141,7 @@ def add_recovery(folder: Path, flights: Sequence[StudentFlight], jobs: int | Non
             work.append((path, records[world], flown))
     add = partial(_add_world, corpus.config, revision())
     with Progress(total=len(work), desc="labeling near-misses", unit="world") as bar:
-        for _ in map_processes(add, work, jobs or available_cores()):
+        for _ in map_processes(add, work, jobs):
             bar.update()
     corpus = Corpus(folder)
     write_ledger(corpus)

@@ -74,11 +74,8 @@ class _Run:
             if [file.name for file in out.iterdir() if file.name[0] != "."] == ["config.yaml"]:
                 (out / "config.yaml").unlink()
             raise
-        self.optimizer = torch.optim.AdamW(
-            trainer.network.parameters(),
-            lr=self.schedule.learning_rate,
-            weight_decay=self.schedule.weight_decay,
-        )
+        weights, decay = trainer.network.parameters(), self.schedule.weight_decay
+        self.optimizer = torch.optim.AdamW(weights, weight_decay=decay)
         self.progress, self.clock = _Progress(), CheckpointClock()
         if self.checkpoint.exists():
             self._resume()

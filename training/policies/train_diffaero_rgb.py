@@ -54,6 +54,7 @@ from splatpilot.training.policies.augmentation import (
     Appearance,
     change_appearance,
     check_noise,
+    color_noise,
     noisy_color,
 )
 from splatpilot.training.policies.networks import (
@@ -166,9 +167,7 @@ class DiffAeroRgbTraining(CorpusTraining):
     bfloat16: bool = False
     # File of DiffAero's weights; the shipped ones if empty.
     policy: str = ""
-    noise: ObservationNoise = field(
-        default_factory=lambda: ObservationNoise(color_noise=0.02, brightness_jitter=0.2)
-    )
+    noise: ObservationNoise = field(default_factory=color_noise)
 
     def check(self) -> None:
         super().check()
@@ -299,9 +298,7 @@ class DistilledRgbTraining(RolloutTraining):
     # Changes of the appearance of each image.
     appearance: Appearance = field(default_factory=lambda: Appearance(hue=0.0))
     # Noise of images.
-    noise: ObservationNoise = field(
-        default_factory=lambda: ObservationNoise(color_noise=0.02, brightness_jitter=0.2)
-    )
+    noise: ObservationNoise = field(default_factory=color_noise)
 
     def check(self) -> None:
         super().check()

@@ -143,4 +143,4 @@ def test_the_same_flights_add_nothing_twice(folder, collected):
     rows = (folder / "ledger.csv").read_text().splitlines()
     assert sum("recovery" in row for row in rows) == 2
     with pytest.raises(ValueError, match="not collected in the world 'P99-7'"):
-        add_recovery(folder, [replace(flight, world="P99-7")])
+        add_recovery(folder, [replace(flight, world="P99-7")], jobs=1)
