@@ -2,10 +2,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from baked_scenes import random_scene
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.special import sph_harm_y
 
 from splatpilot.systems.splats.scene import (
+    ARRAYS,
     GaussianScene,
     choose_origin,
     harmonic_degree,
@@ -19,20 +21,14 @@ def evaluate_sh(sh: Any, directions: Any) -> np.ndarray:
     return np.einsum("...k,...kc->...c", basis, sh)
 
 
-def random_arrays(N: int = 6, K: int = 4, seed: int = 0) -> dict[str, Any]:
-    rng = np.random.default_rng(seed)
-    return {
-        "means": rng.normal(size=(N, 3)),
-        "quats": rng.normal(size=(N, 4)),
-        "scales": np.exp(rng.normal(size=(N, 3))),
-        "opacities": rng.uniform(0.01, 1, size=N),
-        "sh": rng.normal(size=(N, K, 3)),
-    }
+def random_arrays() -> dict[str, Any]:
+    scene = random_scene(6, sh_degree=1)
+    return {name: getattr(scene, name).astype(float) for name in ARRAYS}
 
 
 def test_arrays_are_float32_contiguous_with_unit_quaternions():
     arrays = random_arrays()
-    arrays["means"] = np.asfortranarray(arrays["means"])
+    arrays |= {"means": np.asfortranarray(arrays["means"]), "quats": 3.0 * arrays["quats"]}
     scene = GaussianScene(**arrays)
     for name in arrays:
         array = getattr(scene, name)
@@ -83,7 +79,7 @@ def random_directions(count: int, seed: int = 0) -> np.ndarray:
 
 
 def test_transform_moves_points_shapes_and_view_dependence():
-    scene = GaussianScene(**random_arrays(K=16))
+    scene = random_scene(6)
     X_WO = RigidTransform(RollPitchYaw(0.4, -1.1, 2.3), np.array([1.0, -2.0, 3.0]))
     moved = scene.transformed_by(X_WO)
     R = X_WO.rotation().matrix()
@@ -96,7 +92,7 @@ def test_transform_moves_points_shapes_and_view_dependence():
 
 
 def test_scaled_scene_has_all_lengths_times_the_factor():
-    scene = GaussianScene(**random_arrays(K=9))
+    scene = random_scene(6)
     scaled = scene.scaled_by(2.5)
     np.testing.assert_allclose(scaled.means, 2.5 * scene.means, rtol=1e-6)
     np.testing.assert_allclose(scaled.covariances, 2.5**2 * scene.covariances, rtol=1e-4)
@@ -105,16 +101,13 @@ def test_scaled_scene_has_all_lengths_times_the_factor():
 
 
 def test_merge_pads_the_lower_degree():
-    first = GaussianScene(**random_arrays(N=3, K=9))
-    other = GaussianScene(**random_arrays(N=2, K=4, seed=5))
-    X_WO = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), np.array([10.0, 0.0, 0.0]))
-    placed = other.transformed_by(X_WO)
-    merged = first.merged_with(placed)
+    first, other = random_scene(3, sh_degree=2), random_scene(2, seed=5, sh_degree=1)
+    merged = first.merged_with(other)
     for name in ("means", "quats", "scales", "opacities"):
-        expected = np.concatenate([getattr(first, name), getattr(placed, name)])
+        expected = np.concatenate([getattr(first, name), getattr(other, name)])
         np.testing.assert_array_equal(getattr(merged, name), expected)
     np.testing.assert_array_equal(merged.sh[:3], first.sh)
-    np.testing.assert_array_equal(merged.sh[3:, :4], placed.sh)
+    np.testing.assert_array_equal(merged.sh[3:, :4], other.sh)
     assert not merged.sh[3:, 4:].any()
     assert other.merged_with(first).sh_degree == 2
 

@@ -86,9 +86,9 @@ def test_files_of_and_for_other_tools(tmp_path, degree):
 
 
 def webp(rows: np.ndarray, width: int = 32) -> bytes:
-    """Returns rows (N, 4) as a picture whose last pixels are unused."""
-    picture = np.zeros((-(-len(rows) // width) * width, 4), np.uint8)
-    picture[: len(rows)] = rows
+    """Returns rows (N, 3 or 4) as a picture, opaque if of 3; its last pixels are unused."""
+    picture = np.full((-(-len(rows) // width) * width, 4), 255, np.uint8)
+    picture[: len(rows), : rows.shape[1]] = rows
     stream = io.BytesIO()
     Image.fromarray(picture.reshape(-1, width, 4)).save(stream, "WEBP", lossless=True, exact=True)
     return stream.getvalue()
@@ -96,20 +96,23 @@ def webp(rows: np.ndarray, width: int = 32) -> bytes:
 
 def sog(scene: GaussianScene, version: int) -> dict[str, bytes]:
     """Returns the files of PlayCanvas's published format; harmonics of degree 1 repeat 64 times."""
+    meta, files = {"version": 2, "count": N, "antialias": True} if version == 2 else {}, {}
+
+    def add(part: str, *pictures: bytes, **about) -> None:
+        names = [f"{part}_{i}.webp" for i in range(len(pictures))]
+        files.update(zip(names, pictures, strict=True))
+        meta[part] = about | {"files": names}
+
     logs = np.sign(scene.means) * np.log1p(np.abs(scene.means))
     lower, upper = logs.min(0), logs.max(0)
     words = np.round((logs - lower) / (upper - lower) * 65535).astype(int)
+    bounds = {"mins": lower.tolist(), "maxs": upper.tolist(), "shape": [N, 3]}
+    add("means", webp(words & 255), webp(words >> 8), **bounds)
     order = np.abs(scene.quats).argmax(1)
     quats = scene.quats * np.sign(np.take_along_axis(scene.quats, order[:, None], 1))
     small = np.stack([np.delete(q, k) for q, k in zip(quats, order, strict=True)])
     rotation = np.round((small * np.sqrt(2) + 1) * 127.5).clip(0, 255)
-    bounds = {"mins": lower.tolist(), "maxs": upper.tolist()}
-    files = {
-        "means_l.webp": webp(np.column_stack([words & 255, np.full(N, 255)])),
-        "means_u.webp": webp(np.column_stack([words >> 8, np.full(N, 255)])),
-        "quats.webp": webp(np.column_stack([rotation, order + 252])),
-    }
-    meta = {"means": bounds | {"files": [*files][:2]}, "quats": {"files": ["quats.webp"]}}
+    add("quats", webp(np.column_stack([rotation, order + 252])))
     a = scene.opacities[:, None]
     last = a if version == 2 else np.log(a / (1 - a))
     for name, values in (
@@ -117,25 +120,16 @@ def sog(scene: GaussianScene, version: int) -> dict[str, bytes]:
         ("sh0", np.hstack([scene.sh[:, 0], last])),
     ):
         low, high = values.min(0), values.max(0)
+        about = {"mins": low.tolist(), "maxs": high.tolist()}
         if version == 2:
-            low, high = np.full(values.shape[1], -7.0), np.full(values.shape[1], 7.0)
-            low[3:], high[3:] = 0, 1
-        steps = np.round((values - low) / (high - low) * 255)
-        files[f"{name}.webp"] = webp(np.column_stack([steps, np.full(N, 255)])[:, :4])
-        given = {"codebook": np.linspace(-7, 7, 256).tolist()}
-        if version == 1:
-            given = {"mins": low.tolist(), "maxs": high.tolist()}
-        meta[name] = given | {"files": [f"{name}.webp"]}
+            low, high = (np.array([end] * 3 + [end > 0])[: len(low)] for end in (-7.0, 7.0))
+            about = {"codebook": np.linspace(-7, 7, 256).tolist()}
+        add(name, webp(np.round((values - low) / (high - low) * 255)), **about)
     centroids = np.round((scene.sh[:64, 1:4] + 1) * 127.5).reshape(-1, 3)
-    given = {"codebook": np.linspace(-1, 1, 256).tolist()} if version == 2 else {}
-    meta["shN"] = given | {"mins": -1, "maxs": 1, "files": ["shN_c.webp", "shN_l.webp"]}
-    files["shN_c.webp"] = webp(np.column_stack([centroids, np.full(192, 255)]), width=192)
-    labels = np.zeros((N, 4), int)
-    labels[:, 0], labels[:, 3] = np.arange(N) % 64, 255
-    files["shN_l.webp"] = webp(labels)
-    meta["means"] |= {"shape": [N, 3]}
-    counted = {"version": 2, "count": N, "antialias": True} if version == 2 else {}
-    return files | {"meta.json": json.dumps(meta | counted).encode()}
+    labels = np.column_stack([np.arange(N) % 64, np.zeros((N, 2))])
+    about = {"codebook": np.linspace(-1, 1, 256).tolist()} if version == 2 else {}
+    add("shN", webp(centroids, width=192), webp(labels), mins=-1, maxs=1, **about)
+    return files | {"meta.json": json.dumps(meta).encode()}
 
 
 @pytest.mark.parametrize("version", [1, 2])
