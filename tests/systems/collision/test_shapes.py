@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydrake.math import RigidTransform, RollPitchYaw
-from scipy.spatial import KDTree
+from pydrake import geometry
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.shapes import (
@@ -32,37 +32,32 @@ def field_of(*shapes) -> AnalyticDistanceField:
     return AnalyticDistanceField(shapes, np.full(3, -3.0), np.full(3, 3.0))
 
 
-def surface_points(name: str) -> np.ndarray:
-    """Many points on the surface, made from the shape's own parametrization."""
-    random, shape, n = np.random.default_rng(0), SHAPES[name], 100_000
-    direction = random.normal(size=(n, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    if name == "sphere":
-        return shape.p_WO + shape.radius * direction
-    if name == "half space":
-        normal = np.array([1.0, 2.0, -2.0]) / 3.0
-        p = random.uniform(-4.0, 4.0, (3 * n, 3))
-        return p - np.outer(p @ normal - 0.1, normal)
-    if name == "box":
-        p = random.uniform(-0.5, 0.5, (n, 3))
-        p[np.arange(n), random.integers(0, 3, n)] = random.choice([-0.5, 0.5], n)
-        return X_WO.multiply((p * shape.size).T).T
-    axis = (B - A) / np.linalg.norm(B - A)
-    radial = direction - np.outer(direction @ axis, axis)
-    radial /= np.linalg.norm(radial, axis=1, keepdims=True)
-    side = A + np.outer(random.random(n), B - A) + 0.4 * radial
-    at_b = (direction @ axis > 0.0)[:, None]
-    cap = direction if name == "capsule" else np.sqrt(random.random((n, 1))) * radial
-    return np.concatenate([side, np.where(at_b, B, A) + 0.4 * cap])
+AXIS = RigidTransform(RotationMatrix.MakeFromOneVector(B - A, 2), 0.5 * (A + B))
+LENGTH = np.linalg.norm(B - A)
+DRAKES = {
+    "sphere": (RigidTransform([0.1, 0.2, -0.3]), geometry.Sphere(0.8)),
+    "capsule": (AXIS, geometry.Capsule(0.4, LENGTH)),
+    "cylinder": (AXIS, geometry.Cylinder(0.4, LENGTH)),
+    "box": (X_WO, geometry.Box(0.6, 1.0, 1.4)),
+    "half space": (
+        geometry.HalfSpace.MakePose([1.0, 2.0, -2.0], np.array([1.0, 2.0, -2.0]) / 30),
+        geometry.HalfSpace(),
+    ),
+}
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_distance_is_that_to_the_nearest_surface_point(name):
-    p = np.random.default_rng(1).uniform(-1.5, 1.5, (400, 3))
-    distance = field_of(SHAPES[name]).distance(p)
-    nearest, _ = KDTree(surface_points(name)).query(p)
-    np.testing.assert_allclose(np.abs(distance), nearest, atol=0.02)
-    assert (nearest - np.abs(distance) > -1e-9).all()  # samples are never nearer than the surface
+def test_distances_are_drakes(name):
+    scene_graph = geometry.SceneGraph()
+    source = scene_graph.RegisterSource("test")
+    instance = geometry.GeometryInstance(*DRAKES[name], "shape")
+    anchored = scene_graph.RegisterAnchoredGeometry(source, instance)
+    scene_graph.AssignRole(source, anchored, geometry.ProximityProperties())
+    query = scene_graph.get_query_output_port().Eval(scene_graph.CreateDefaultContext())
+    p_WQ = np.random.default_rng(1).uniform(-1.5, 1.5, (400, 3))
+    expected = [query.ComputeSignedDistanceToPoint(p)[0].distance for p in p_WQ]
+    distance = field_of(SHAPES[name]).distance(p_WQ)
+    np.testing.assert_allclose(distance, expected, atol=1e-12)
     assert (distance < 0.0).any() and (distance > 0.0).any()
 
 
