@@ -457,7 +457,7 @@ def _texts(config: type) -> dict[str, str]:
                 texts[name] = " ".join(text.split())
             case ast.AnnAssign(target=ast.Name(name)), _:
                 texts[name] = _comment(lines, statement)
-    return texts
+    return {name: text for name, text in texts.items() if text}
 
 
 def _comment(lines: list[str], field: ast.stmt) -> str:
