@@ -20,6 +20,7 @@ from splatpilot.systems.policies.base import (
     heading_observation,
     inverse_depth,
     limit_smoothly,
+    pool_depth,
 )
 from splatpilot.systems.policies.velocity import tracking_acceleration
 from splatpilot.systems.sensing.time_of_flight import (
@@ -134,8 +135,7 @@ class DiffAeroTofLearner(DiffAeroLearner):
         """Encodes depth (N, R) [m] as `TimeOfFlightGrid` does: proximities (N, 9, 16)."""
         sensor, (H, W) = self._sensor, self._range_of_depth.shape
         depth = torch.where(depth > UNMEASURED_DEPTH, depth, sensor.max_range).reshape(-1, H, W)
-        blocks = (-1, sensor.rows, H // sensor.rows, sensor.columns, W // sensor.columns)
-        nearest = (depth * self._range_of_depth).reshape(blocks).amin((2, 4))
+        nearest = pool_depth(depth * self._range_of_depth, sensor.rows, sensor.columns)
         return (1.0 - nearest.clamp(0.0, sensor.max_range) / sensor.max_range).flip(1)
 
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
