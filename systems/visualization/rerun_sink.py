@@ -154,7 +154,9 @@ class RerunSink(LeafSystem):
         """Opens the file, and records what does not change."""
         self.close()
         self._outcome = None
-        self._recording = self._rr.RecordingStream("splatpilot", recording_id="flight")
+        # The viewer shows files of one identity as one recording.
+        identity = str(Path(self._path).resolve())
+        self._recording = self._rr.RecordingStream("splatpilot", recording_id=identity)
         self._recording.save(self._path, default_blueprint=self._layout())
         for path, value in self._statics:
             self._recording.log(path, value, static=True)

@@ -96,6 +96,15 @@ def test_recording_is_valid_and_holds_everything_on_one_timeline(recording):
     assert columns(recording, "/events")["TextLog:text"] == [["start"], ["goal"]]
 
 
+def test_recordings_of_two_files_are_two_recordings(recording, tmp_path):
+    moved = tmp_path / "other.rrd"
+    sink = RerunSink(moved, {})
+    Simulator(sink).Initialize()
+    sink.close()
+    ids = [rrd.RrdReader(path).recordings()[0].recording_id for path in (recording, moved)]
+    assert len(set(ids)) == 2
+
+
 def test_unknown_port_is_refused(tmp_path):
     port = ConstantVectorSource([0.0]).get_output_port()
     with pytest.raises(ValueError, match=r"ports must be some of state, .* got wings"):
