@@ -232,8 +232,7 @@ def _put(config: Any, path: FieldPath, distribution: Any, prefix: str) -> None:
         prefix += f"{holder}."
     if not isinstance(config, dict | list):
         if name not in field_types(config):
-            hint = _hint(config, name, None, prefix)
-            raise ValueError(f"there is no field {prefix}{name}; {hint}")
+            raise _unknown_field(config, name, None, prefix)
         is_ours, text = dataclasses.is_dataclass(config), distribution_text(distribution)
         require(is_ours, f"{prefix}{name}", "one value", text)
     DrawnField(path, config, distribution).put(distribution)
@@ -257,8 +256,7 @@ def _check_names(config: Any, given: Any, prefix: str, kinds: Sequence[Any] = ()
             _check_names(config.get(name), value, f"{prefix}{name}.", kinds)
             continue
         if name not in known:
-            hint = _hint(config, name, value, prefix)
-            raise ValueError(f"there is no field {prefix}{name}; {hint}")
+            raise _unknown_field(config, name, value, prefix)
         if value is None and NoneType in get_args(known[name]):
             continue
         _check_type(f"{prefix}{name}", known[name], value)
@@ -283,15 +281,15 @@ def _tagged_types(expected: Any) -> list[Any]:
     return [option for option in options if dataclasses.is_dataclass(option)]
 
 
-def _hint(config: Any, name: Any, value: Any, prefix: str) -> str:
+def _unknown_field(config: Any, name: Any, value: Any, prefix: str) -> ValueError:
     """Suggests fields of the same name elsewhere, fields that `value` names, or similar names."""
-    known = field_types(config)
+    known = sorted(field_types(config))
     fields = _nested(config, str(name), prefix)
     fields += [prefix + each for each in _names(value) if each in known]
-    if fields:
-        return f"did you mean {' or '.join(fields)}?"
-    listed = ", ".join(sorted(prefix + other for other in known))
-    return did_you_mean(str(name), sorted(known), prefix) or f"the fields are {listed}"
+    hint = f"did you mean {' or '.join(fields)}?" if fields else ""
+    hint = hint or did_you_mean(str(name), known, prefix)
+    hint = hint or f"the fields are {', '.join(prefix + other for other in known)}"
+    return ValueError(f"there is no field {prefix}{name}; {hint}")
 
 
 def _nested(config: Any, name: str, prefix: str) -> list[str]:
