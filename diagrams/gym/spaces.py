@@ -304,7 +304,9 @@ class FlightEnvConfig(Config):
     # and 1.2 m.
     action_limits: list[float] = bounded(list, "(0, inf)")
     # Camera of the images.
-    camera: OnboardCamera = field(default_factory=lambda: OnboardCamera(max_depth=12.0))
+    camera: OnboardCamera = field(
+        default_factory=lambda: OnboardCamera(max_depth=12.0, merged_spread=2.0)
+    )
     # From transitions of N vehicles to their rewards (N,).
     reward: Callable[[Transition], NDArray[np.float64]] = field(default_factory=Reward)
     # From transitions of N vehicles to the flights (N,) that end, besides those of `AddFlight`.
