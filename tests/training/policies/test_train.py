@@ -31,7 +31,7 @@ CARDS = sorted((Path(policy_checkpoint.__file__).parent / "weights").glob("*.md"
 
 SMALL = ["worlds.kinds=[P10]", "worlds.count=1", "worlds.held_out=1", "worlds.voxel_size=0.5"]
 SMALL += ["schedule.updates=6", "schedule.validate_every=3", "schedule.checkpoint_every=2"]
-SMALL += ["validation.patience=0.3"]
+SMALL += ["validation.patience=0.1"]
 FEW = ["rollout.environments=4", "rollout.steps=4"]
 OF_POLICY = {
     "diffaero": FEW,
@@ -232,7 +232,7 @@ def test_miniature_learns_to_fly(tmp_path):
         "validation.patience=4",
     ]
     overrides += ["rollout.environments=16", "rollout.steps=20", "worlds.voxel_size=0.5"]
-    overrides += [f"schedule.{name}=60" for name in ("updates", "validate_every")]
+    overrides += [f"schedule.{name}=45" for name in ("updates", "validate_every")]
     overrides.append("schedule.learning_rate=0.002")
     config = load_config(DiffAeroTraining(), overrides=overrides)
     held_out = training_worlds.validation_worlds(config.worlds)
