@@ -14,8 +14,8 @@ struct GridField {
   double upper_W[3];
   bool occupied_outside;
 
-  // The interpolant; outside, minus the distance to the box, or NaN with a gradient of zero. The
-  // gradient is written unless it is null.
+  // The interpolant; outside, minus the distance to the box, or NaN. The gradient, zero where that
+  // is not finite, is written unless it is null.
   double distance(const double* p, double* gradient) const {
     double in_box[3], beyond[3];
     bool inside = true;
@@ -38,7 +38,8 @@ struct GridField {
         at.gradient[k] = (beyond[k] == 0.0 ? at.gradient[k] : 0.0) - beyond[k] / away;
       }
     }
-    if (gradient) std::copy_n(at.gradient, 3, gradient);
+    const bool is_known = std::isfinite(at.value);  // not of points that are not finite
+    for (int k = 0; gradient && k < 3; ++k) gradient[k] = is_known ? at.gradient[k] : 0.0;
     return at.value;
   }
 };
