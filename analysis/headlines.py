@@ -137,7 +137,7 @@ def environments(effort: Effort) -> Iterator[Headline]:
             scenario,
             num_worlds=effort.worlds,
             observation=(*images, *states),
-            camera=replace(camera, width=width, height=height, merged_spread=2.0),
+            camera=replace(camera, width=width, height=height, merged_spread=1.0),
             threads=available_cores(),
             rate=RATE,
             pool=envs["state"].pool if envs else None,

@@ -305,7 +305,7 @@ class FlightEnvConfig(Config):
     action_limits: list[float] = bounded(list, "(0, inf)")
     # Camera of the images.
     camera: OnboardCamera = field(
-        default_factory=lambda: OnboardCamera(max_depth=12.0, merged_spread=2.0)
+        default_factory=lambda: OnboardCamera(max_depth=12.0, merged_spread=1.0)
     )
     # From transitions of N vehicles to their rewards (N,).
     reward: Callable[[Transition], NDArray[np.float64]] = field(default_factory=Reward)

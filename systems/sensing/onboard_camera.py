@@ -42,8 +42,8 @@ class OnboardCamera(Config):
     X_BC: Transform = field(default_factory=level_mount)
     # [s] Between reading the first row of an image and the last; 0 is a global shutter.
     readout: float = bounded(0.0, "[0, 0.2] s")
-    # [px] Neighbors that spread by less on the image have one color. 2 makes RGB of 64x48 pixels
-    # twice as fast and nearer to the mean over each pixel; 0 merges none.
+    # [px] Neighbors that spread by less on the image have one color. 1 makes RGB of 64x48 pixels
+    # up to four times as fast, and nearer to the mean over each pixel; 0 merges none.
     merged_spread: float = bounded(0.0, "[0, 4] px")
 
     __eq__ = equal_by_fields
