@@ -78,7 +78,7 @@ class Labels(NamedTuple):
 
 
 class StudentData:
-    """The distinct samples of corpora, of which worlds are held out; images stay on disk."""
+    """Holds the distinct samples of corpora, with held-out worlds; images stay on disk."""
 
     def __init__(self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu") -> None:
         first = corpora[0].config

@@ -66,7 +66,7 @@ def test_round_trip(folder, world):
 
 @pytest.fixture
 def painted(folder, world, box_room):
-    """What is written as a scene folder with a frontier and a sky."""
+    """Writes a scene folder with a frontier and a sky; returns metadata, world and frontier."""
     texels = np.random.default_rng(0).random((8, 16, 3), np.float32)
     world = replace(world, background=EnvironmentMap(texels))
     frontier = box_room(6, 3, 3).gaussians(1.0)
