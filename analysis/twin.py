@@ -232,7 +232,9 @@ def predictions(
         mesh, splat = cubes["mesh"][part], cubes["splat"][part]
         row: dict[str, Any] = {"environment": name, "flights": mesh.size}
         row |= {"mesh": mesh.mean(), "splat": splat.mean()}
-        for kind, prefix in zip(kinds[::2], ("", "again_"), strict=False):
+        for kind, prefix in (("splat", ""), ("again", "again_")):
+            if kind not in cubes:
+                continue
             other = cubes[kind][part]
             row[f"{prefix}agreement"] = np.mean(mesh == other)
             row[f"{prefix}kappa"] = cohen_kappa(mesh, other)

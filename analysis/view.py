@@ -79,8 +79,9 @@ def run(
     elif not is_scene and not _may_hold_gaussians(path):
         shown = _capture(path, overrides)
     else:
-        found, remedy = "".join(overrides[:1]), "leave it out"
-        require(not overrides, "--set", "of a scenario or a capture", found, remedy)
+        if overrides:
+            got = f"got {overrides[0]}; leave it out"
+            raise ValueError(f"--set must be of a scenario or a capture, {got}")
         shown = _scene(path) if is_scene else _gaussians(path)
     require_writable_folder(out.absolute().parent)
     meshcat = empty_meshcat(shown.background)

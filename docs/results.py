@@ -440,11 +440,13 @@ def report_digest() -> bytes:
 
 
 if __name__ == "__main__":
-    known: dict[str, Callable[..., None]] = {
-        each.__name__: each for each in (keep, keep_realism, write, pdf)
-    }
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("`docs/")[0])
-    parser.add_argument("command", choices=known)
-    parser.add_argument("arguments", nargs="*", help="STUDY NAME, or FOLDER...")
-    options = parser.parse_args()
-    known[options.command](*options.arguments)
+    commands = parser.add_subparsers(dest="command", required=True)
+    known = {each.__name__: each for each in (keep, keep_realism, write, pdf)}
+    parsers = {name: commands.add_parser(name, help=each.__doc__) for name, each in known.items()}
+    parsers["keep"].add_argument("study")
+    parsers["keep"].add_argument("name")
+    parsers["keep_realism"].add_argument("folders", nargs="+")
+    options = vars(parser.parse_args())
+    chosen = options.pop("command")
+    known[chosen](*options.pop("folders", ()), **options)

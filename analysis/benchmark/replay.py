@@ -55,7 +55,8 @@ def run(
     `rerun` is the file of a `RerunSink`."""
     folder = StudyFolder(study)
     spec, row, recorded = _read_flight(folder, id)
-    if (spec.policy, LIVE) in [each[:2] for each in folder.config().variants]:
+    variants = folder.config().variants
+    if any(each.label == spec.policy and each.policy == LIVE for each in variants):
         raise ValueError(
             f"{id} was flown by a system that a function of Python made; fly it again by the same "
             "call of study, in another folder"

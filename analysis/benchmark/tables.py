@@ -292,9 +292,9 @@ class Comparison(NamedTuple):
 def compare(rows: list[Row], config: StudyConfig) -> list[Comparison]:
     """Compares all pairs of a study's policies at each speed, with Holm's correction."""
     bases = {each.label: each.base for each in config.scenario_variants}
+    ordered = sorted(rows, key=lambda row: (row["scenario"], row["seed"]))
     pairs = []
     for speed in config.speeds:
-        ordered = sorted(rows, key=lambda row: (row["scenario"], row["seed"]))
         flown = {name: select(ordered, policy=name, speed=speed) for name in config.policy_names}
         for names in combinations(config.policy_names, 2):
             first, second = (np.array([r["success"] for r in flown[name]], bool) for name in names)

@@ -7,7 +7,6 @@ from typing import Any
 from splatpilot.analysis.commands import options as cli
 from splatpilot.analysis.commands.flight import WORLD_FIELDS
 from splatpilot.systems.common.extras import import_extra
-from splatpilot.systems.common.validation import require
 
 _AXES = "x", "-x", "y", "-y", "z", "-z"
 
@@ -105,12 +104,14 @@ def mesh(options: argparse.Namespace) -> None:
     if scenario is not None:
         scenario.validate()
         esdf = make_world(scenario.world, scenario.seed).esdf
+    elif not (what / "scene.yaml").is_file():
+        raise ValueError(
+            f"{what} must be a scene folder, OctoMap or scenario, which have distances; "
+            "reconstruct it first"
+        )
+    elif options.overrides:
+        raise ValueError(f"--set must be of a scenario, got {options.overrides[0]}; leave it out")
     else:
-        kinds, remedy = "a scene folder, OctoMap or scenario", "reconstruct it first"
-        is_scene = (what / "scene.yaml").is_file()
-        require(is_scene, str(what), kinds, "a file without distances", remedy)
-        found, remedy = "".join(options.overrides[:1]), "leave it out"
-        require(not options.overrides, "--set", "of a scenario", found, remedy)
         esdf = read_scene_folder(what).esdf
     made = field_mesh(esdf, options.conservative)
     write_mesh(options.out, made)

@@ -151,7 +151,7 @@ class AblationStudy:
 
 def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
     """Returns the settings of an arm, with the same steps, images and photometry. The first of a
-    representation uses no other metric depth, but for the smallest size of Gaussians."""
+    representation uses metric depth only for the smallest size of Gaussians."""
     own = {"representation": arm.representation, "distance_field": "captured"}
     return replace(config, **own, **_STEPS[arm.step][1])
 

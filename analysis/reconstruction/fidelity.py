@@ -430,9 +430,11 @@ def study_scene(
 
 
 def store_bounds(scene: Path, study: FidelityStudy) -> SceneMetadata:
-    """Writes the maximum displacement [m] of each pose, left, right, up and down within the study's
-    limit of unseen pixels and the farthest sample, and of all poses, which is the reach or, of
-    held-out frames, the median over the poses, into `scene.yaml`."""
+    """Writes into `scene.yaml` how far [m] each pose may move left, right, up and down.
+
+    Farther, more pixels are unseen than the study allows, or nothing was measured. The bound of all
+    poses is the reach or, of held-out frames, the median.
+    """
     views = SceneViews(scene)
     support, X_WCs = _support(views), views.capture.X_WCs
     farthest = study.column("offset").max()

@@ -175,10 +175,11 @@ class FlightEnv(gymnasium.Env):
             self.config = config
             self._flights.clear()
         base, draw = self.config.scenario, self.np_random.integers
-        world = self._find_world(replace(base, seed=base.seed + int(draw(self.config.num_worlds))))
+        world_seed = base.seed + int(draw(self.config.num_worlds))
         scenario = replace(base, seed=int(draw(MAX_SEED)), **points)
         if points:
             scenario.validate()
+        world = self._find_world(replace(base, seed=world_seed))
         self._take_flight(scenario, world)
         context = self.simulator.get_mutable_context()
         if only_start_is_random(base):

@@ -382,7 +382,7 @@ def env_config(
     num_worlds = arguments.get("num_worlds", 1)
     require(world is None or num_worlds == 1, "num_worlds", "1 with a world", num_worlds)
     known = [each.name for each in fields(FlightEnvConfig)[1:]]
-    for name in set(arguments) - set(known):
+    for name in (each for each in arguments if each not in known):
         raise ValueError(unknown("argument", name, known))
     config = FlightEnvConfig(find_scenario(scenario), **arguments)
     config.validate()

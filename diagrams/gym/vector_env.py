@@ -127,8 +127,8 @@ class VectorFlightEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.time_step = 1.0 / self.config.rate
-        for name in ("scenario.controller.period", "scenario.simulator.max_step_size", "gravity"):
-            values = {attrgetter(name)(config) for config in configs}
+        for name in ("controller.period", "simulator.max_step_size", "vehicle.gravity"):
+            values = {attrgetter(name)(config.scenario) for config in configs}
             require(len(values) == 1, name, "the same in all scenarios", sorted(values))
         self._steps = integration_steps(self.config.scenario)
         self._steps["periods"] = round(self.time_step / self.config.scenario.controller.period)
@@ -231,7 +231,7 @@ class VectorFlightEnv(VectorEnv):
     ) -> None:
         """Begins flights of the environments `rows`, drawn from the pool unless they are given;
         `points` moves their start or goal."""
-        pool, arrays = self.pool, self._arrays
+        pool, arrays, points = self.pool, self._arrays, points or {}
         if flights is None:
             drawn = _hash(_hash(self._seeds[rows]) + self._episodes[rows])
             flights = self._choices[(drawn % np.uint64(len(self._choices))).astype(int)]
@@ -243,7 +243,7 @@ class VectorFlightEnv(VectorEnv):
         self._previous[rows], self._count[rows] = 0.0, 0
         for row, flight in zip(rows, flights, strict=True) if points else ():
             world = pool.worlds[pool.world[flight]]
-            scenario = replace(pool.scenarios[flight], **(points or {}))
+            scenario = replace(pool.scenarios[flight], **points)
             scenario.validate()
             arrays.states[row] = sample_initial_state(scenario, world)
             arrays.goals[row] = goal_position(scenario, world)

@@ -216,10 +216,11 @@ def require_supported(config: FlightEnvConfig, scenario: Scenario) -> None:
         readout = config.camera.readout
         require(readout == 0.0, "camera.readout of VectorFlightEnv", "0", readout, _OTHER)
     for name, value in neutral.items():
-        found, condition = attrgetter(name)(scenario), str(value)
+        found, condition = attrgetter(name)(scenario), "left out" if value == {} else str(value)
         valid = found == value
         if is_configuration(value):
-            found, condition = type(found).__name__, "left out"
+            is_other = type(found) is not type(value)
+            found, condition = type(found).__name__ if is_other else "other values", "left out"
         require(valid, f"{name} of VectorFlightEnv", condition, found, _OTHER)
     longest, period = max(scenario.decision_delay, default=0.0), 1.0 / config.rate
     condition = f"at most the policy's period, {period:g} s, in VectorFlightEnv"

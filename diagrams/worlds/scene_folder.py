@@ -154,8 +154,8 @@ _MAX_VOXEL = 0.25  # [m], at which a vehicle of 0.354 m radius still finds a rou
 
 
 def read_scene(path: str | Path, hatched: bool = False) -> World:
-    """Reads a scene folder, or a file of Gaussians alone, see `read_splats`, without which space
-    counts as free."""
+    """Reads a scene folder, or a file of Gaussians (see `read_splats`), where space without
+    Gaussians counts as free."""
     path = Path(path)
     if path.is_dir() and sog_meta(path) is None:
         return read_scene_folder(path, hatched=hatched)

@@ -24,8 +24,8 @@ template <typename... Shape>
 using Floats = Array<const float, Shape...>;
 template <typename... Shape>
 using Doubles = Array<const double, Shape...>;
-// An array that a function writes. Python's must have the right type: else a converted copy would
-// be written instead.
+// An array that a function writes. Python must pass the exact type: a converted copy would be
+// written instead.
 template <typename T, typename... Shape>
 struct Written : Array<T, Shape...> {
   Written() = default;

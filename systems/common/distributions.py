@@ -221,9 +221,9 @@ def draw(distribution: Any, seed: int, name: str) -> Any:
 def take_distributions(text: str, path: FieldPath = ()) -> tuple[str, dict[FieldPath, Any]]:
     """Returns a YAML text without the distributions in it, and these by their paths, which begin
     with `path`. Items of lists become 0. Transforms keep theirs."""
-    if not _TAG.search(text):
+    root = yaml.compose(text, yaml.SafeLoader) if _TAG.search(text) else None
+    if root is None:  # also of comments alone
         return text, {}
-    root = yaml.compose(text, yaml.SafeLoader)
     for _, again in yaml_collections(root):  # Taking one from a node that stands twice takes both.
         require(not again, "YAML with distributions", "without *", "*", "write it out")
     found: dict[FieldPath, Any] = {}

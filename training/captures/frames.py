@@ -72,7 +72,8 @@ def image_header(file: Path) -> tuple[tuple[int, int], str]:
     with readers.readable(file, "image"):
         with Image.open(file) as image:
             size, form, mode = image.size, image.format, image.mode
-            if "transparency" in image.info:  # of one color, or of those of a palette
+            # Of one color, or of those of a palette; OpenCV drops that of 16-bit depth.
+            if "transparency" in image.info and not mode.startswith("I"):
                 mode = "RGBA"
         with file.open("rb") as stream:
             # Cameras append previews and padding to JPEGs, so the end is searched.

@@ -8,6 +8,7 @@ ScanNet++ adds `is_bad` and `test_frames`. Lengths are taken to be in meters if 
 
 import dataclasses
 import json
+from os.path import isfile
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -145,7 +146,7 @@ def _pose(matrix: Any, source: str) -> RigidTransform:
 
 def _image_file(file: Path) -> Path:
     """Returns the file of an image, whose name may be without its suffix."""
-    if file.is_file() or file.suffix.lower() in IMAGE_SUFFIXES or not file.parent.is_dir():
+    if isfile(file) or file.suffix.lower() in IMAGE_SUFFIXES or not file.parent.is_dir():
         return file
     return next((f for f in sorted(file.parent.iterdir()) if f.stem == file.name), file)
 

@@ -222,7 +222,7 @@ def _factor_from_depth(capture: Capture) -> float:
     """Returns the median ratio of measured depth to that of the points; few are hidden."""
     ratios = [np.zeros(0)]
     points = capture.points.p_WQ if capture.points is not None else np.zeros((0, 3))
-    for i in range(len(capture)):
+    for i in range(len(capture) if capture.has_depth and len(points) else 0):
         p_CQ = capture.X_WCs[i].inverse().multiply(points.T).T
         inside, rows, columns = project_points(capture.K, p_CQ, capture.width, capture.height)
         measured = capture.registered_depth(i)[rows, columns]

@@ -52,7 +52,8 @@ class Demonstration(NamedTuple):
 def keep_clear(labels: Iterable[Label], field: Esdf) -> list[Demonstration]:
     """Drops trajectories in contact, and states without others."""
     kept = []
-    for state, waypoints_W in ((label.state, label.plan.waypoints_W) for label in labels):
+    for state, plan in labels:
+        waypoints_W = plan.waypoints_W
         clear = (field.distance(waypoints_W) > VEHICLE_RADIUS).all(axis=1)  # (K,)
         if clear.any():
             waypoints_W = np.where(clear[:, None, None], waypoints_W, np.nan)
@@ -95,8 +96,8 @@ def render_samples(
     return samples
 
 
-# Of states off the expert's paths, whose images show neither near obstacles straight ahead nor
-# stops near the goal.
+# Of states off the expert's paths: its flights show neither near obstacles straight ahead nor stops
+# near the goal.
 STATES_PER_APPEARANCE = 60
 
 _CLEARANCE = 0.05  # [m], minimum clearance

@@ -389,10 +389,8 @@ of error and clearance."""
         self.spec = StudentSpec(config.observation, *size, nominal_speed=self._data.speed)
         self.network = StudentModule(self.spec)
         if config.begin:
-            shapes, begin = (
-                self.spec.weight_shapes(),
-                load_checkpoint(config.begin, config.observation),
-            )
+            shapes = self.spec.weight_shapes()
+            begin = load_checkpoint(config.begin, config.observation)
             weights = begin.build(lambda _, weights: check_weights(weights, shapes))
             self.network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
         elif config.pretrained:

@@ -269,21 +269,17 @@ def _world_turns(selection: WorldSelection, count: int, first: int) -> list[tupl
     return list(zip(range(first, first + count), cycle(selection.turns), strict=False))
 
 
-def _captured_worlds(selection: WorldSelection) -> dict[str, World]:
-    """Makes the worlds of the scenes."""
-    return {
-        scene: make_world(scene_config(library.training_scene(scene)), seed=0)
-        for scene in selection.scenes
-    }
+def _captured_world(scene: str) -> World:
+    return make_world(scene_config(library.training_scene(scene)), seed=0)
 
 
 def _make_worlds(
     selection: WorldSelection, count: int, first: int, what: str
 ) -> list[TrainingWorld]:
-    scenes = {
-        scene: (world.esdf, world.esdf.conservative())
-        for scene, world in _captured_worlds(selection).items()
-    }
+    scenes = {}
+    for scene in selection.scenes:  # One at a time: their Gaussians need memory.
+        esdf = _captured_world(scene).esdf
+        scenes[scene] = esdf, esdf.conservative()
     cache, worlds = WorldCache(), []
     turns = _world_turns(selection, count, first)
     for seed, turn in Progress(turns, f"making {what}", unit="world"):
@@ -303,7 +299,7 @@ class WorldViews:
     def __init__(
         self, selection: WorldSelection, count: int, first: int, camera: OnboardCamera
     ) -> None:
-        scenes = _captured_worlds(selection)
+        scenes = {scene: _captured_world(scene) for scene in selection.scenes}
         turns = Progress(_world_turns(selection, count, first), "rendering worlds", unit="world")
         self._worlds = [
             scenes.get(turn) or make_world(library.scenario_world(turn), seed)

@@ -68,7 +68,7 @@ def test_study_has_all_flights_tables_and_a_report(study, rows_of):
     assert not list(out.rglob(".*"))
 
 
-def test_study_interrupted_before_its_flights_is_resumed(benchmark, monkeypatch):
+def test_study_interrupted_before_its_flights_is_resumed(benchmark, monkeypatch, tmp_path, rows_of):
     def interrupt(*words):
         raise KeyboardInterrupt
 
@@ -76,6 +76,7 @@ def test_study_interrupted_before_its_flights_is_resumed(benchmark, monkeypatch)
         patch.setattr(run_study, "keep_inputs", interrupt)
         assert benchmark("begun", "--policies", "straight") == 130
     assert benchmark("begun", "--policies", "straight") == 0
+    assert len(rows_of(tmp_path / "begun" / "rollouts.csv")) == 1
 
 
 def test_damaged_files_are_flown_again_and_reported(study, tmp_path, capsys, contents):

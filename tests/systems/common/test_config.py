@@ -1,4 +1,6 @@
 import os
+import subprocess
+import sys
 from dataclasses import dataclass, field
 
 import pytest
@@ -117,7 +119,10 @@ def test_missing_files_are_named(path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        *((text, "a.yaml: the text must be fields") for text in (b"", b"# seed: 3\n", b"---\n")),
+        *(
+            (text, "a.yaml: the text must be fields")
+            for text in (b"", b"# seed: 3\n", b"---\n", b"# x: !Uniform {}\n")
+        ),
         (b"timout: 3\n", "a.yaml: there is no field timout; did"),
         (b"timeout: 2\ntimeout: 3", "a.yaml: fields must be given once, got timeout"),
         (b"world: {}\nseed: 1\nworld: {width: 9}", "a.yaml: fields must be given once, got world"),
@@ -167,6 +172,13 @@ def test_registry_fields_are_read_and_written_as_drake_does():
     assert yaml_load_typed(schema=Scenario, data=yaml_dump_typed(scenario)) == scenario
     changed = load_config(scenario, overrides=["policy.rate=9"]).policy
     assert changed == ReactiveConfig(margin=0.3, rate=9)
+
+
+def test_tags_are_known_in_a_new_process_that_imports_the_package_alone():
+    text = "policy: !ReactiveConfig {}\nworld: !WallsConfig {}"
+    read = "from pydrake.common.yaml import yaml_load_typed as load; import splatpilot as sp"
+    program = f"{read}; load(schema=sp.Scenario, data={text!r})"
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_override_creates_and_removes_a_configuration():

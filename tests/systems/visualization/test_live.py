@@ -159,9 +159,8 @@ def test_simulation_pauses_steps_changes_its_rate_draws_the_slice_and_restarts(f
     until(lambda: not seen("paused"), "resume", resume.click)
     until(lambda: seen("rate") == 0.25, "rate", lambda: set_slider(flying.tab, RATE_SLIDER, 0.25))
     wall, flown = time.perf_counter(), seen("time")
-    time.sleep(0.5)
-    rate = (seen("time") - flown) / (time.perf_counter() - wall)
-    assert rate == pytest.approx(0.25, abs=0.1)
+    until(lambda: seen("time") > flown + 0.2, "flight at a quarter of the rate")
+    assert time.perf_counter() - wall > 0.6  # A loaded machine may be slower, never faster.
     until(lambda: seen("slice"), "slice", lambda: set_slider(flying.tab, SLICE_SLIDER, 1.5))
     until(lambda: flying.ended, "restart", lambda: keyboard.press("r"))
     assert flying.ended == RESTART
