@@ -62,7 +62,8 @@ class CaptureConfig(Config):
     """Capture format: a name in `splatpilot.training.captures.capture_registry.CAPTURES`, or
     `module:attribute` of a `CaptureFormat`; empty: recognized by the files."""
     intrinsics: list[float] = bounded(list, "(-inf, inf) px")
-    """fx, fy, cx, cy [px] of the color camera, which the registration of photographs keeps."""
+    """fx, fy, cx, cy [px] of the color camera, which the registration of photographs keeps. The
+    distortion stays that of the files."""
     depth_intrinsics: list[float] = bounded(list, "(-inf, inf) px")
     """fx, fy, cx, cy [px] of a depth camera other than the color camera."""
     p_DC: list[float] = bounded(list, "(-inf, inf) m")

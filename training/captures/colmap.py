@@ -223,13 +223,15 @@ def _unmasked_points(
 
 
 def _lens(camera: "pycolmap.Camera", config: CaptureConfig) -> Lens:
-    K, source = camera.calibration_matrix(), "the COLMAP model"
-    if config.intrinsics:
+    found = camera.calibration_matrix()
+    K, source = found, "the COLMAP model"
+    if config.intrinsics:  # which replace those of the model; its distortion stays
         K, source = pinhole(*config.intrinsics), "capture.intrinsics"
-    if config.intrinsics or camera.is_undistorted():
+    if camera.is_undistorted():
         return Lens(K, camera.width, camera.height, source=source)
 
     def project(rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+        pixels = np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+        return (pixels - found[:2, 2]) / np.diag(found)[:2] * np.diag(K)[:2] + K[:2, 2]
 
     return Lens(K, camera.width, camera.height, project, source=source)

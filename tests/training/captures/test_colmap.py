@@ -215,8 +215,13 @@ def test_distorted_model(model):
     for i, X_WC in enumerate(CAMERA_POSES):
         image = trace(X_WC, rays).image
         cv2.imwrite(str(model / f"images/{i:02d}.png"), image[..., ::-1])
-    capture = read_capture(model, CaptureConfig(scale=ScaleConfig(factor=1 / SHRINK)))
-    assert_shows_room(capture, CAMERA_POSES[0] @ capture.X_WCs[0].inverse(), color=3.0, depth=None)
+    for focal, given in ((50.0, []), (44.0, [50.0, 50.0, 31.0, 25.0])):
+        camera.params = [focal, 31.0, 25.0, -0.12]
+        reconstruction.write(model / "sparse/0")
+        config = CaptureConfig(scale=ScaleConfig(factor=1 / SHRINK), intrinsics=given)
+        capture = read_capture(model, config)
+        X_WM = CAMERA_POSES[0] @ capture.X_WCs[0].inverse()
+        assert_shows_room(capture, X_WM, color=3.0, depth=None)
 
 
 def test_missing_and_damaged_parts_are_refused(model):
