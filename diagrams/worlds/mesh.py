@@ -46,6 +46,7 @@ _VISIBLE = 1 / 255  # alpha from which a BLEND is visible
 _SAMPLES_PER_VOXEL_FACE = 8
 _NEAREST = 9728
 _WRAPS = {33071: "clamp", 33648: "mirror"}
+_UV, _FLOAT = "TEXCOORD_0", 5126
 # Required extensions that cannot be read, with a remedy each.
 _UNREAD = {
     "EXT_meshopt_compression": "decompress it with `gltf-transform copy IN.glb OUT.glb`",
@@ -68,10 +69,16 @@ def check_mesh(mesh: Path) -> None:
     require(suffix in SUFFIXES, f"{mesh}: the suffix", known, mesh.suffix)
     if suffix != ".obj":
         with readable(mesh, "mesh"):
-            required = _description(mesh.read_bytes()).get("extensionsRequired", [])
+            description = _description(mesh.read_bytes())
+            required = description.get("extensionsRequired", [])
+            parts = [part for each in description.get("meshes", []) for part in each["primitives"]]
+            found = {part["attributes"].get(_UV) for part in parts} - {None}
+            types = {description["accessors"][index]["componentType"] for index in found}
         for extension, remedy in _UNREAD.items():
             what, condition = f"{mesh}: extensionsRequired", f"without {extension}"
             require(extension not in required, what, condition, required, remedy)
+        what, remedy = f"{mesh}: componentType of {_UV}", _UNREAD["KHR_mesh_quantization"]
+        require(types <= {_FLOAT}, what, f"{_FLOAT}, of floats", sorted(types), remedy)
 
 
 def mesh_digests(mesh: Path) -> set[str]:

@@ -212,6 +212,7 @@ SECOND = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 
         ("nodes", {"scale": [0.01] * 3}, "longest side must be in .* scale=1000 if .* kilometers"),
         ("extensionsRequired", ["KHR_mesh_quantization"], "without KHR_mesh_q.*form dequantize"),
         ("extensionsRequired", ["EXT_meshopt_compression"], "without EXT_meshopt_c.*; decompress"),
+        ("accessors", {"componentType": 5123}, "TEXCOORD_0 must be 5126, .*5123.*form dequantize"),
         ("materials", SECOND, "texCoord of baseColorTexture must be 0, got 1"),
     ],
 )
