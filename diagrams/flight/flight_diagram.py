@@ -64,12 +64,13 @@ from splatpilot.systems.vehicle.quadrotor_geometry import QuadrotorGeometry, qua
 from splatpilot.systems.visualization.flight_visualizer import DRAWINGS, FlightVisualizer
 from splatpilot.systems.visualization.meshcat_drawing import (
     CameraVisualizer,
-    MovingSpheresVisualizer,
+    MovingBodiesVisualizer,
     draw_box,
     draw_distance_slice,
     draw_frustum,
     draw_gaussians,
     draw_goal,
+    vehicle_path,
 )
 from splatpilot.systems.visualization.rerun_sink import RerunSink
 from splatpilot.systems.visualization.video import VideoRecorder
@@ -183,7 +184,7 @@ def AddFlight(
     require_type(scenario, Scenario, "scenario")
     require_type(world, World, "world")
     before = builder.GetSystems()
-    prefix = "" if name == "flight" else f"{name}_"
+    prefix = _prefix(name)
     if isinstance(policy, str):
         policy = DecisionInput(policy)
     elif not (policy is None or isinstance(policy, System)):
@@ -342,10 +343,20 @@ def AddMovingBody(
 
 def _moving_bodies(builder: DiagramBuilder, parts: FlightParts) -> MovingBodies:
     """Returns the system `moving` of a flight; adds it if it is missing."""
-    name = "moving" if parts.name == "flight" else f"{parts.name}_moving"
-    if builder.HasSubsystemNamed(name):
-        return cast(MovingBodies, builder.GetSubsystemByName(name))
+    if (moving := _find(builder, parts, "moving")) is not None:
+        return cast(MovingBodies, moving)
+    name = _prefix(parts.name) + "moving"
     return AddMovingBodies(builder, parts.world, [*parts.systems, parts.policy], name)
+
+
+def _prefix(flight: str) -> str:
+    return "" if flight == "flight" else f"{flight}_"
+
+
+def _find(builder: DiagramBuilder, parts: FlightParts, name: str) -> System | None:
+    """Returns the system of a flight that `AddFlight` lists by this name, None without any."""
+    name = _prefix(parts.name) + name
+    return builder.GetSubsystemByName(name) if builder.HasSubsystemNamed(name) else None
 
 
 def _require_apart(parts: FlightParts, other: FlightParts) -> None:
@@ -487,6 +498,7 @@ def AddMeshcat(
     builder: DiagramBuilder, parts: FlightParts, meshcat: Meshcat, draw: Collection[str] = ()
 ) -> None:
     """Draws a world, and adds visualizers of vehicle, plans and camera, and controls of `Teleop`.
+    Bodies of `AddMovingBody` are drawn if they were added before.
 
     Args:
         parts: of a flight in the builder, as `AddFlight` returns them.
@@ -494,7 +506,10 @@ def AddMeshcat(
             of the policy's camera; "limits" of the world.
     """
     check_drawings(draw)
-    world = parts.world
+    condition = "True, for Meshcat shows its images"
+    require(parts.camera is not None, "camera of AddFlight", condition, False)
+    assert parts.camera is not None  # for type checkers
+    world, folder = parts.world, vehicle_path(parts.plant, "plant")
     field = world.distance_field
     margin = np.array([5.0, 5.0, 3.0])  # [m] of surroundings
     draw_gaussians(
@@ -507,10 +522,12 @@ def AddMeshcat(
     if "limits" in draw:
         draw_box(meshcat, "/splatpilot/limits", field.lower_W, field.upper_W)
     if "frustum" in draw:
-        named = builder.HasSubsystemNamed("policy_camera")
-        require(named, "draw", "without frustum for a policy without images", "frustum")
-        seen = cast(SplatCamera, builder.GetSubsystemByName("policy_camera"))
-        draw_frustum(meshcat, "/splatpilot/vehicle/policy_camera", seen.camera_info(), seen.X_BC())
+        seen = cast(SplatCamera | None, _find(builder, parts, "policy_camera"))
+        condition = "without frustum for a policy without images"
+        require(seen is not None, "draw", condition, "frustum")
+        assert seen is not None  # for type checkers
+        path = f"{folder}/vehicle/policy_camera"
+        draw_frustum(meshcat, path, seen.camera_info(), seen.X_BC())
     if isinstance(parts.policy, Teleop):
         parts.policy.add_controls(meshcat)
 
@@ -518,8 +535,7 @@ def AddMeshcat(
     outputs = ("distance", "gradient", "barrier")
     sources = {name: parts.collision.GetOutputPort(name) for name in outputs}
     sources |= {"command": parts.command, parts.decision.get_name(): parts.decision}
-    if plans is not None:
-        selector = builder.GetSubsystemByName("selector")
+    if (selector := _find(builder, parts, "selector")) is not None:
         sources["waypoint"] = selector.GetOutputPort("waypoint")
     vehicle = [name for name in draw if name not in ("depth", "frustum", "limits")]
     FlightVisualizer.AddToBuilder(
@@ -531,10 +547,10 @@ def AddMeshcat(
         sources=sources,
         radius=parts.scenario.vehicle.radius,
     )
-    if world.moving:
-        visualizer = MovingSpheresVisualizer(meshcat, world.moving.spheres)
-        builder.AddNamedSystem("spheres_visualizer", visualizer)
-    assert parts.camera is not None
+    if (moving := _find(builder, parts, "moving")) is not None:
+        visualizer = MovingBodiesVisualizer(meshcat, f"{folder}/moving")
+        builder.AddNamedSystem(f"{moving.get_name()}_visualizer", visualizer)
+        builder.Connect(moving.get_output_port(), visualizer.get_input_port())
     fps = parts.scenario.camera.fps
     CameraVisualizer.AddToBuilder(
         builder, parts.camera, meshcat, period=1 / fps, depth="depth" in draw

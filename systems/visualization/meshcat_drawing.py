@@ -22,8 +22,8 @@ from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.collision.distance_field import DistanceField, FieldState
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
-from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.splats.lens import pixel_slopes
+from splatpilot.systems.splats.moving_bodies import Bodies
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_parts
@@ -33,8 +33,8 @@ def draw_gaussians(
     meshcat: Meshcat,
     path: str,
     scene: GaussianScene,
-    lower_W: np.ndarray,
-    upper_W: np.ndarray,
+    lower_W: np.ndarray | float = -np.inf,
+    upper_W: np.ndarray | float = np.inf,
     max_points: int = 120_000,
 ) -> None:
     """Draws the centers of the Gaussians in the box from lower_W to upper_W as colored points,
@@ -281,23 +281,41 @@ def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
     return json.dumps(document)
 
 
-_HIDDEN = np.array([0.0, 0.0, -1000.0])  # [m], of spheres that are absent
+_HIDDEN = np.array([0.0, 0.0, -1000.0])  # [m], of bodies that are absent
 
 
-class MovingSpheresVisualizer(LeafSystem):
-    """Draws moving spheres at the Context's time, sphere k at `/splatpilot/spheres/k`; no ports."""
+class MovingBodiesVisualizer(LeafSystem):
+    """Draws bodies that move: obstacles of a world as spheres, others by their Gaussians.
 
-    def __init__(self, meshcat: Meshcat, spheres: MovingSpheres, period: float = 1 / 15):
+    .. pydrake_system::
+
+        name: MovingBodiesVisualizer
+        input_ports: [moving]
+
+    - ``moving``: that of `MovingBodies`; body k is drawn at `PATH/k`.
+    """
+
+    def __init__(self, meshcat: Meshcat, path: str = "/splatpilot/moving", period: float = 1 / 15):
         super().__init__()
-        self._meshcat, self._spheres = meshcat, spheres
-        for k, radius in enumerate(spheres.radii):
-            meshcat.SetObject(f"/splatpilot/spheres/{k}", Sphere(radius), Rgba(0.9, 0.75, 0.1))
+        self._meshcat, self._path = meshcat, path
+        meshcat.Delete(path)  # of another diagram
+        self.DeclareAbstractInputPort("moving", Value(object()))
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
 
     def _publish(self, context: Context) -> EventStatus:
-        time = context.get_time()
-        for k, center in enumerate(self._spheres.centers(time)):
-            p_WO = center if np.isfinite(center).all() else _HIDDEN
-            self._meshcat.SetTransform(f"/splatpilot/spheres/{k}", RigidTransform(p_WO), time)
+        bodies = cast(Bodies, self.get_input_port().Eval(context))
+        time, first = bodies.time, len(bodies.radii) - len(bodies.tracks)
+        for k, (center, radius) in enumerate(zip(bodies.centers(time), bodies.radii, strict=True)):
+            path, is_new = f"{self._path}/{k}", not self._meshcat.HasPath(f"{self._path}/{k}")
+            if k >= first:
+                track = bodies.tracks[k - first]
+                X_WO = track.pose(time)
+                if is_new:
+                    draw_gaussians(self._meshcat, path, track.gaussians)
+            else:
+                X_WO = RigidTransform(center if np.isfinite(center).all() else _HIDDEN)
+                if is_new:
+                    self._meshcat.SetObject(path, Sphere(radius), Rgba(0.9, 0.75, 0.1))
+            self._meshcat.SetTransform(path, X_WO, time)
         return EventStatus.Succeeded()

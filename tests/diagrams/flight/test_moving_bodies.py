@@ -11,6 +11,7 @@ from pydrake.systems.primitives import ConstantValueSource
 
 from splatpilot.diagrams.flight.flight_diagram import (
     AddFlight,
+    AddMeshcat,
     AddMovingBody,
     BuildFlightDiagram,
 )
@@ -148,8 +149,8 @@ def test_meshcat_shows_moving_spheres_and_a_start_in_one_is_refused(post_world):
     world = with_sphere(post_world, falling(1.0, 0.0, 3.0))
     for flown, shown in ((post_world, False), (world, True)):
         diagram = BuildFlightDiagram(hovering(), flown, meshcat=meshcat)
-        assert diagram.HasSubsystemNamed("spheres_visualizer") == shown
-        assert meshcat.HasPath("/splatpilot/spheres/0") == shown
+        diagram.ForcedPublish(diagram.CreateDefaultContext())
+        assert meshcat.HasPath("/splatpilot/moving/0") == shown
 
 
 @pytest.mark.parametrize(
@@ -193,6 +194,30 @@ def test_vehicles_see_each_other(open_world):
         assert clearance <= 2.0 - 2 * VEHICLE_RADIUS + 1e-9
     with pytest.raises(InfeasibleFlightError, match="starts of three and flight must be >"):
         AddFlight(DiagramBuilder(), scenario, open_world, name="three", others=[one])
+
+
+def test_meshcat_draws_each_flight_by_its_own_systems(open_world):
+    meshcat, builder, drawn = Meshcat(), DiagramBuilder(), {}
+    for name, policy, draw in (
+        ("flight", "planner", ["waypoint"]),
+        ("two", "planner", ["waypoint"]),
+        ("three", "reactive", ["frustum"]),
+    ):
+        start = [1.0, {"flight": -2.0, "two": 0.0, "three": 2.0}[name], 2.0]
+        scenario = Scenario(start_radius=0.0, policy=policy_named(policy), start=start)
+        others = [drawn["flight"]] if name == "two" else []
+        drawn[name] = AddFlight(builder, scenario, open_world, name=name, others=others)
+        AddMeshcat(builder, drawn[name], meshcat, draw)
+    with pytest.raises(ValueError, match="camera of AddFlight must be True"):
+        AddMeshcat(builder, drawn["two"]._replace(camera=None), meshcat)
+    diagram = builder.Build()
+    root = diagram.CreateDefaultContext()
+    diagram.ForcedPublish(root)
+    visualizer = diagram.GetSubsystemByName("two_flight_visualizer")
+    waypoint = visualizer.GetInputPort("waypoint").Eval(visualizer.GetMyContextFromRoot(root))
+    assert abs(waypoint[1]) < 0.5 < waypoint[0]
+    assert meshcat.HasPath("/splatpilot/three/vehicle/policy_camera/frustum")
+    assert meshcat.HasPath("/splatpilot/two/moving/0")  # the first, of which it knows
 
 
 def test_spheres_of_a_scenario_move(post_world):

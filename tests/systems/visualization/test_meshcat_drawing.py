@@ -13,13 +13,14 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource
+from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, TrajectorySource
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, MovingSpheres, Sphere
 from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.splats.moving_bodies import MovingBodies, MovingObstacles
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import hover_state
 from splatpilot.systems.vehicle.state import StateToPose
@@ -31,7 +32,7 @@ from splatpilot.systems.visualization.flight_visualizer import (
 )
 from splatpilot.systems.visualization.meshcat_drawing import (
     CameraVisualizer,
-    MovingSpheresVisualizer,
+    MovingBodiesVisualizer,
     draw_distance_slice,
     draw_gaussians,
     draw_goal,
@@ -100,13 +101,13 @@ def test_visualizers_of_two_vehicles_draw_by_forced_publish(meshcat):
         CameraVisualizer.AddToBuilder(builder, camera, meshcat, depth=True)
         VideoRecorder.AddToBuilder(builder, camera, 15.0)
     spheres = MovingSpheres([0.5], [np.array([[float(k), 0, 1] for k in range(20)])], 0.1)
-    builder.AddSystem(MovingSpheresVisualizer(meshcat, spheres))
+    add_moving(builder, MovingBodiesVisualizer(meshcat), spheres)
     diagram = builder.Build()
     assert diagram.HasSubsystemNamed("b_flight_visualizer") and diagram.HasSubsystemNamed("video")
     context = diagram.CreateDefaultContext()
     context.SetTime(16 / 15)  # not a multiple of the stride
     diagram.ForcedPublish(context)
-    assert position(meshcat, "/splatpilot/spheres/0") == [10, 0, 1]
+    assert position(meshcat, "/splatpilot/moving/0") == [10, 0, 1]
     assert position(meshcat, "/splatpilot/vehicle") == [0, 0, 1]
     assert position(meshcat, "/splatpilot/b/vehicle") == [1, 0, 1]
     for name in ("picture", "frustum", "depth"):
@@ -167,17 +168,31 @@ def test_fan_is_ribbons_along_the_plans_in_the_colors_of_their_costs():
     np.testing.assert_allclose(colors, [[0, 1, 0.1], [1, 0, 0.1], [1, 0, 0.1]])
 
 
-def test_moving_spheres_are_drawn(meshcat):
+def add_moving(builder, visualizer, spheres):
+    gaussians = uniform_scene([[0.0, 0, 0]], [0.1] * 3)
+    obstacles = MovingObstacles(spheres, [gaussians] * len(spheres.radii))
+    moving = builder.AddSystem(MovingBodies(obstacles))
+    builder.AddSystem(visualizer)
+    builder.Connect(moving.get_output_port(), visualizer.get_input_port())
+    return moving
+
+
+def test_moving_bodies_are_drawn(meshcat):
     paths = [np.array([[1.0, 2, 3], [2, 2, 3], [4, 2, 3]]), np.array([[0.0, 0, 1], [np.inf] * 3])]
     spheres = MovingSpheres([0.5, 0.25], paths, period=0.1)
     builder = DiagramBuilder()
-    builder.AddSystem(MovingSpheresVisualizer(meshcat, spheres, period=0.1))
+    moving = add_moving(builder, MovingBodiesVisualizer(meshcat, period=0.1), spheres)
+    port = moving.DeclareBody("bird", uniform_scene([[0.0, 0, 0.5]], [0.1] * 3), 0.1)
+    X_WO = RigidTransform(RollPitchYaw(0, 0, 1), [7.0, 8, 9])
+    pose = builder.AddSystem(ConstantValueSource(Value(X_WO)))
+    builder.Connect(pose.get_output_port(), port)
     simulator = Simulator(builder.Build())
     for time, expected in ((0.15, [[2, 2, 3], [0, 0, -1000]]), (0.25, [[4, 2, 3], [0, 0, 1]])):
         simulator.AdvanceTo(time)
-        for k, p_WO in enumerate(expected):
-            assert position(meshcat, f"/splatpilot/spheres/{k}") == p_WO
-    assert drawn(meshcat, "/splatpilot/spheres/1")["geometries"][0]["radius"] == 0.25
+        for k, p_WO in enumerate([*expected, [7, 8, 9]]):
+            assert position(meshcat, f"/splatpilot/moving/{k}") == p_WO
+    assert drawn(meshcat, "/splatpilot/moving/1")["geometries"][0]["radius"] == 0.25
+    assert drawn(meshcat, "/splatpilot/moving/2")["object"]["type"] == "Points"
 
 
 def test_gaussians_are_drawn_as_points_of_their_size(meshcat):
