@@ -186,7 +186,7 @@ class Esdf:
 
     def save(self, path: str | Path) -> None:
         """Writes the field, by custom `esdf.npz`, atomically."""
-        with written_atomically(Path(path)) as partial, partial.open("wb") as file:
+        with written_atomically(path) as partial, partial.open("wb") as file:
             np.savez_compressed(
                 file,
                 version=np.int64(FORMAT_VERSION),

@@ -116,7 +116,7 @@ class Observations:
 
     def save(self, path: str | Path) -> None:
         """Writes the voxels, by custom `observations.npz`, atomically."""
-        with written_atomically(Path(path)) as partial, partial.open("wb") as file:
+        with written_atomically(path) as partial, partial.open("wb") as file:
             np.savez_compressed(
                 file,
                 version=np.int64(FORMAT_VERSION),

@@ -39,12 +39,15 @@ class _UnwritableError(OSError):
 
 
 @contextmanager
-def written_atomically(path: Path, check: Callable[[Path], None] | None = None) -> Iterator[Path]:
+def written_atomically(
+    path: str | Path, check: Callable[[Path], None] | None = None
+) -> Iterator[Path]:
     """Yields a temporary path next to `path` that is renamed to `path` when the block ends.
 
     An exception in the block removes the temporary file; `path` stays. An OSError names `path`.
     `check` raises OSError for a file that its writer has silently left incomplete.
     """
+    path = Path(path)
     partial = _temporary(path, path.stem, path.suffix)  # Many writers choose the format by suffix.
     try:
         with _naming(path, partial):
@@ -57,7 +60,7 @@ def written_atomically(path: Path, check: Callable[[Path], None] | None = None) 
         partial.unlink(missing_ok=True)
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: str | Path, text: str) -> None:
     """Writes a text file, atomically."""
     with written_atomically(path) as partial:
         partial.write_text(text)

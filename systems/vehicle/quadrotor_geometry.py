@@ -23,6 +23,7 @@ from pydrake.geometry import (
     Sphere,
 )
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort
 
 from splatpilot.systems.common.drake import vector_input, weak_callback
@@ -149,7 +150,8 @@ class QuadrotorGeometry(LeafSystem):
     ) -> "QuadrotorGeometry":
         """Registers the vehicle and adds the system of its pose, both named `name`.
 
-        Renderers and viewers show `quadrotor_parts`. Contacts and distances are those of a sphere.
+        Renderers and viewers show `quadrotor_parts`. Contacts and distances are those of a sphere,
+        which is left out beside a MultibodyPlant in the builder: it refuses contacts with others.
 
         Args:
             label: of the vehicle in label images; `RenderLabel.kDontCare` if None.
@@ -168,7 +170,8 @@ class QuadrotorGeometry(LeafSystem):
             scene_graph.RegisterGeometry(source, frame, geometry)
         sphere = GeometryInstance(RigidTransform(), Sphere(radius), "collision")
         sphere.set_proximity_properties(ProximityProperties())
-        scene_graph.RegisterGeometry(source, frame, sphere)
+        if not any(isinstance(system, MultibodyPlant) for system in builder.GetSystems()):
+            scene_graph.RegisterGeometry(source, frame, sphere)
         system = QuadrotorGeometry(frame)
         builder.AddNamedSystem(name, system)
         builder.Connect(state_port, system.GetInputPort("state"))

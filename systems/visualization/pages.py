@@ -104,7 +104,7 @@ class HtmlPage:
         style = "width: 100%; height: 600px; border: 0"
         return f'<iframe srcdoc="{escape(self.html)}" style="{style}"></iframe>'
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Writes the page atomically."""
         write_text(path, self.html)
 

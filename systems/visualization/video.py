@@ -91,7 +91,7 @@ class VideoRecorder(LeafSystem):
             depth = np.where(frame["depth"] < TOO_FAR, frame["depth"] * 1e-3, np.inf)
             yield frame["rgb"][..., ::-1], colorize_depth(depth, max_depth)
 
-    def save(self, path: Path, max_depth: float) -> None:
+    def save(self, path: str | Path, max_depth: float) -> None:
         """Writes the video (H.264 in MP4) atomically; `max_depth` as in `frames`."""
         height, width = self._frame["depth"].shape
         odd = height % 2  # Players need even sizes.

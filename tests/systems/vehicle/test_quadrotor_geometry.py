@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from pydrake.geometry import Box, GeometryInstance, ProximityProperties, RenderLabel, SceneGraph
 from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.systems.framework import DiagramBuilder
 
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant, hover_state
@@ -30,3 +31,17 @@ def test_the_vehicle_is_seen_and_collides_in_a_scene_graph():
     pairs = query.ComputeSignedDistancePairwiseClosestPoints()
     to_wall = [pair.distance for pair in pairs if anchored in (pair.id_A, pair.id_B)]
     assert to_wall == [pytest.approx(0.5 - VEHICLE_RADIUS)] * 2
+
+
+def test_vehicles_pass_through_the_bodies_of_a_multibody_plant():
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), RigidTransform(), Box(1, 1, 1), "block", CoulombFriction()
+    )
+    plant.Finalize()
+    vehicle = builder.AddSystem(QuadrotorPlant())  # at the origin, in the block
+    QuadrotorGeometry.AddToBuilder(builder, vehicle.GetOutputPort("state"), scene_graph)
+    root = builder.Build().CreateDefaultContext()
+    results = plant.get_contact_results_output_port().Eval(plant.GetMyContextFromRoot(root))
+    assert results.num_point_pair_contacts() == 0
