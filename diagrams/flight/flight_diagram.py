@@ -103,27 +103,49 @@ def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
 
 
 class FlightParts(NamedTuple):
-    """Systems and ports of a flight, see `AddFlight`."""
+    """Systems and ports of a flight, see `AddFlight`.
 
-    name: str  #: Name of the flight.
-    scenario: Scenario  #: Scenario, with values drawn from its distributions.
-    world: World  #: World, with the scenario's moving obstacles and appearance.
-    plant: System  #: Vehicle.
-    estimator: System | None  #: Source of the state that policy and controller know.
-    policy: System  #: Policy.
-    controller: System | None  #: Controller; None if the policy decides the command.
-    collision: System  #: `EsdfCollision`.
-    camera: SplatCamera | None  #: Scenario's camera; policies see `policy_camera`.
-    geometry: QuadrotorGeometry | None  #: Vehicle in the SceneGraph.
-    monitor: FlightMonitor  #: Ends the flight.
-    state: OutputPort  #: (13), the true state.
-    pose: OutputPort  #: The true X_WB.
-    goal: OutputPort  #: (3) p_WG [m].
-    decision: OutputPort  #: Of the policy: `hypotheses` or one of `DECISIONS`.
-    command: OutputPort  #: (4) to the vehicle: thrust [m/s^2], body rates [rad/s].
-    observation: dict[str, OutputPort]  #: Inputs of the policy by name.
-    measured: dict[str, OutputPort]  #: Outputs of sensors by name.
-    systems: list[System]  #: All that the flight added.
+    Args:
+        name: Name of the flight.
+        scenario: Scenario, with values drawn from its distributions.
+        world: World, with the scenario's moving obstacles and appearance.
+        plant: Vehicle.
+        estimator: Source of the state that policy and controller know.
+        policy: Policy.
+        controller: Controller; None if the policy decides the command.
+        collision: `EsdfCollision`.
+        camera: Scenario's camera; policies see `policy_camera`.
+        geometry: Vehicle in the SceneGraph.
+        monitor: Ends the flight.
+        state: (13), the true state.
+        pose: The true X_WB.
+        goal: (3) p_WG [m].
+        decision: Of the policy: `hypotheses` or one of `DECISIONS`.
+        command: (4) to the vehicle: thrust [m/s^2], body rates [rad/s].
+        observation: Inputs of the policy by name.
+        measured: Outputs of sensors by name.
+        systems: All that the flight added.
+    """
+
+    name: str
+    scenario: Scenario
+    world: World
+    plant: System
+    estimator: System | None
+    policy: System
+    controller: System | None
+    collision: System
+    camera: SplatCamera | None
+    geometry: QuadrotorGeometry | None
+    monitor: FlightMonitor
+    state: OutputPort
+    pose: OutputPort
+    goal: OutputPort
+    decision: OutputPort
+    command: OutputPort
+    observation: dict[str, OutputPort]
+    measured: dict[str, OutputPort]
+    systems: list[System]
 
 
 def AddFlight(

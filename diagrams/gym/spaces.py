@@ -32,18 +32,31 @@ from splatpilot.systems.vehicle.state import QuadrotorState
 
 
 class Transition(NamedTuple):
-    """One step of N vehicles."""
+    """One step of N vehicles.
 
-    states: NDArray[np.float64]  #: (N, 13) true ones at its beginning, see `QuadrotorState`
-    next_states: NDArray[np.float64]  #: (N, 13) true ones at its end
-    p_WG: NDArray[np.float64]  #: (N, 3) [m], goals
-    distances: NDArray[np.float64]  #: (N,) [m] from p_WB at its end to the nearest surface, or NaN
-    actions: NDArray[np.float64]  #: (N, n) in [-1, 1]
-    previous_actions: NDArray[np.float64]  #: (N, n); zeros in the first step of a flight
-    reached: NDArray[np.bool_]  #: (N,), the flight ended at the goal
-    failed: NDArray[np.bool_]  #: (N,), the flight ended by a collision or outside of the world
-    duration: float  #: [s]
-    radius: float = VEHICLE_RADIUS  #: [m] of the vehicle
+    Args:
+        states: (N, 13) true ones at its beginning, see `QuadrotorState`
+        next_states: (N, 13) true ones at its end
+        p_WG: (N, 3) [m], goals
+        distances: (N,) [m] from p_WB at its end to the nearest surface, or NaN
+        actions: (N, n) in [-1, 1], of the range of `action_limits`
+        previous_actions: (N, n); zeros in the first step of a flight
+        reached: (N,), the flight ended at the goal
+        failed: (N,), the flight ended by a collision or outside of the world; not by `terminate`
+        duration: [s]
+        radius: [m] of the vehicle
+    """
+
+    states: NDArray[np.float64]
+    next_states: NDArray[np.float64]
+    p_WG: NDArray[np.float64]
+    distances: NDArray[np.float64]
+    actions: NDArray[np.float64]
+    previous_actions: NDArray[np.float64]
+    reached: NDArray[np.bool_]
+    failed: NDArray[np.bool_]
+    duration: float
+    radius: float = VEHICLE_RADIUS
 
 
 @dataclass
@@ -226,8 +239,9 @@ def require_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[np.float64]
     given = np.asarray(actions, dtype=float)
     require(given.shape == shape, "shape of action", str(shape), given.shape)
     outside = given[~(np.abs(given) <= 1.0)]  # NaN too
-    remedy = "clip actions, as gymnasium.wrappers.ClipAction does"
-    require(not outside.size, "action", "in [-1, 1]", next(iter(outside), None), remedy)
+    first = next(iter(outside), np.nan)
+    remedy = "" if np.isnan(first) else "clip actions, as gymnasium.wrappers.ClipAction does"
+    require(not outside.size, "action", "in [-1, 1]", first, remedy)
     return given
 
 
@@ -383,7 +397,8 @@ def env_config(
     require(world is None or num_worlds == 1, "num_worlds", "1 with a world", num_worlds)
     known = [each.name for each in fields(FlightEnvConfig)[1:]]
     for name in (each for each in arguments if each not in known):
-        raise ValueError(unknown("argument", name, known))
+        of_scenario = f"fields of scenario, as {name}" if hasattr(Scenario(), name) else ""
+        raise ValueError(unknown("argument", name, known, of_scenario))
     config = FlightEnvConfig(find_scenario(scenario), **arguments)
     config.validate()
     return config

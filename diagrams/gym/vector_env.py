@@ -114,6 +114,9 @@ class VectorFlightEnv(VectorEnv):
         require(world is None or pool is None, "world", "left out with a pool", world)
         configs = [env_config(each, world, **fields) for each in scenarios]
         self.num_envs, self.render_mode, self.config = num_envs, render_mode, configs[0]
+        modes = [mode.value for mode in AutoresetMode]
+        valid = autoreset_mode in [*AutoresetMode, *modes]
+        require(valid, "autoreset_mode", f"one of {', '.join(modes)}", repr(autoreset_mode))
         self._mode = AutoresetMode(autoreset_mode)
         self.metadata = {
             "autoreset_mode": self._mode,

@@ -20,4 +20,10 @@ def _add(app: Sphinx, docname: str, source: list[str]) -> None:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("source-read", _add)
+    app.connect("autodoc-skip-member", _skip)
     return {"parallel_read_safe": True}
+
+
+def _skip(app: Sphinx, what: str, name: str, member: object, skip: bool, options: object) -> bool:
+    """Skips fields of named tuples, whose classes describe them."""
+    return skip or (member.__doc__ or "").startswith("Alias for field number")

@@ -103,6 +103,7 @@ def test_invalid_actions_are_errors(value):
         ({"observation": ["goal", "goal"]}, "observation must be different"),
         ({"reward": 1.0}, "reward must be a function"),
         ({"actions": "velocity"}, "there is no argument 'actions'; did you mean"),
+        ({"appearance": 1}, "there is no argument 'appear.*, fields of scenario, as appearance$"),
         ({"observation": ["depht"]}, r"observation must be one of state, .* got 'depht'"),
     ],
 )

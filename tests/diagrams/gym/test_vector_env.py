@@ -340,6 +340,7 @@ def test_seeds_and_scenarios_of_flights_are_known(post_world):
             "imaging of VectorFlightEnv must be left out",
         ),
         ({"num_envs": 0}, "num_envs must be at least 1"),
+        ({"autoreset_mode": "next_step"}, "autoreset_mode must be one of NextStep, .*'next_step'"),
         ({"render_mode": "human"}, "render_mode must be rgb_array or None"),
     ],
 )
