@@ -27,6 +27,7 @@ from splatpilot.systems.splats.scene import (
 )
 
 _EXTENSION = "KHR_gaussian_splatting"
+_READ = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
 _HARMONICS = [f"SH_DEGREE_{d}_COEF_{n}" for d in range(MAX_DEGREE + 1) for n in range(2 * d + 1)]
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -132,8 +133,10 @@ class _Buffers:
 
 
 def _unpack_primitive(file: _Buffers, primitive: dict[str, Any]) -> Arrays:
-    kernel = primitive["extensions"][_EXTENSION].get("kernel", "ellipse")
-    require(kernel == "ellipse", "the kernel", "ellipse", kernel)
+    about = primitive["extensions"][_EXTENSION]
+    for name, known in _READ.items():
+        value = about.get(name, known)
+        require(value == known, f"the {name}", known, value)
     attributes = primitive["attributes"]
 
     def attribute(name: str) -> NDArray[np.float64]:
@@ -196,7 +199,6 @@ def write_gltf(scene: GaussianScene, path: Path) -> None:
     accessors[0] |= {"min": scene.means.min(0).tolist(), "max": scene.means.max(0).tolist()}
     starts = np.cumsum([0, *(array.nbytes for array in arrays)]).tolist()
     body = b"".join(array.tobytes() for array in arrays)
-    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     primitive = {"mode": 0, "attributes": {name: i for i, name in enumerate(named)}}
     node: dict[str, Any] = {"mesh": 0}
     if any(scene.origin):
@@ -207,7 +209,7 @@ def write_gltf(scene: GaussianScene, path: Path) -> None:
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
-        "meshes": [{"primitives": [primitive | {"extensions": {_EXTENSION: splats}}]}],
+        "meshes": [{"primitives": [primitive | {"extensions": {_EXTENSION: _READ}}]}],
         "accessors": accessors,
         "bufferViews": [
             {"buffer": 0, "byteOffset": start, "byteLength": a.nbytes, "target": _VERTICES}

@@ -176,6 +176,14 @@ def test_gltf_is_y_up_and_its_nodes_transform(tmp_path):
     np.testing.assert_allclose(found.covariances, M @ scene.covariances @ M.T, atol=2e-5, rtol=1e-4)
 
 
+def test_gltf_of_linear_colors_is_refused(tmp_path):
+    write_splats(random_scene(0), tmp_path / "a.gltf")
+    text = (tmp_path / "a.gltf").read_text().replace("srgb_rec709_display", "lin_rec709_display")
+    (tmp_path / "a.gltf").write_text(text)
+    with pytest.raises(ValueError, match=r"colorSpace must be srgb_.*, got lin_rec709_display"):
+        read_splats(tmp_path / "a.gltf")
+
+
 def test_usd_of_other_units_axes_and_defaults(tmp_path):
     (tmp_path / "a.usda").write_text(
         """#usda 1.0
