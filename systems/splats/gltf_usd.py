@@ -156,7 +156,9 @@ def _placed_meshes(document: dict[str, Any]) -> Iterator[tuple[NDArray[np.float6
     """Yields the transform (4, 4) and number of each mesh in the scene."""
     nodes = document.get("nodes", [])
     scenes = document.get("scenes", [])
-    roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
+    inner = {child for node in nodes for child in node.get("children", [])}
+    outer = [index for index in range(len(nodes)) if index not in inner]
+    roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else outer
     pending = [(np.eye(4), index, 0) for index in roots]
     while pending:
         X, index, depth = pending.pop()

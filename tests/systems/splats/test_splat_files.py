@@ -174,6 +174,9 @@ def test_gltf_is_y_up_and_its_nodes_transform(tmp_path):
     M = RotationMatrix.MakeZRotation(np.pi / 2).matrix() @ np.diag([2.0, 6.0, 2.0])
     np.testing.assert_allclose(found.means, scene.means @ M.T, atol=1e-5)
     np.testing.assert_allclose(found.covariances, M @ scene.covariances @ M.T, atol=2e-5, rtol=1e-4)
+    del document["scene"], document["scenes"]
+    (tmp_path / "b.gltf").write_text(json.dumps(document))
+    np.testing.assert_array_equal(read_splats(tmp_path / "b.gltf").means, found.means)
 
 
 def test_gltf_of_linear_colors_is_refused(tmp_path):
