@@ -24,6 +24,7 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule, Shape, Sphere
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import bounded
+from splatpilot.systems.splats.scene import concatenated
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 GAP = 1.3 * 2 * VEHICLE_RADIUS  # [m], minimum width of gaps
@@ -76,7 +77,8 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
     name, ends = f"{scene.name}_inserted", (scene.p_WS, scene.p_WG)
     box = esdf.lower_W, esdf.upper_W
     spec = WorldSpec(name, *box, solids, *ends, light=lambda _: light, seed=seed)
-    gaussians = draw(spec, solids, light).merged_with(scene.gaussians)  # the frontier stays last
+    parts = draw(spec, solids, light), scene.gaussians  # the frontier stays last
+    gaussians = replace(scene.gaussians, **concatenated(parts))
     observations = scene.observations
     if observations is not None:
         spacing = observations.voxel_size

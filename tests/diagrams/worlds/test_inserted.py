@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -5,7 +6,12 @@ import pytest
 
 from splatpilot.diagrams.worlds.feasibility import connects
 from splatpilot.diagrams.worlds.inserted import GAP, InsertedConfig
-from splatpilot.diagrams.worlds.scene_folder import SceneConfig, find_scene, write_scene_folder
+from splatpilot.diagrams.worlds.scene_folder import (
+    SceneConfig,
+    find_scene,
+    read_scene_folder,
+    write_scene_folder,
+)
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
@@ -73,6 +79,14 @@ def test_inserted_solids_are_seen_hit_and_leave_gaps(hall, monkeypatch):
     assert connects(world.esdf.conservative(), *ends, GAP / 2 - 0.05, 0.1)
     again = make_world(InsertedConfig(path="hall"), 0)
     np.testing.assert_array_equal(world.gaussians.means, again.gaussians.means)
+
+
+def test_scenes_with_inserted_solids_stay_antialiased(hall, tmp_path):
+    scene = read_scene_folder(hall / "hall")
+    scene = replace(scene, gaussians=replace(scene.gaussians, antialiased=True))
+    write_scene_folder(tmp_path / "hall", scene)
+    world = make_world(InsertedConfig(path=str(tmp_path / "hall")), 0)
+    assert len(world.gaussians) > 100 and world.gaussians.antialiased
 
 
 def test_inserted_solids_count_as_observed(house):
