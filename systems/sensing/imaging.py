@@ -156,7 +156,8 @@ def matched_depth(
     )
     disparity = disparity[np.ix_(rows, columns)]
     fb = camera.focal_x * sensor.width / camera.width * sensor.baseline
-    return np.where(disparity > 0.0, fb / np.where(disparity > 0.0, disparity, 1.0), np.inf)
+    valid = (disparity > 0.0) & (disparity <= sensor.max_disparity)
+    return np.where(valid, fb / np.where(valid, disparity, 1.0), np.inf)
 
 
 def time_of_flight_depth(

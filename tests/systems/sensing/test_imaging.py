@@ -235,5 +235,10 @@ def test_matching_measures_only_textured_planes_to_a_fifth_of_a_pixel():
     assert matched.mean() > 0.9
     assert np.median(errors) < 0.2
     assert np.mean(errors > 1.0) < 0.03  # at the outline of the board
+    # OpenCV matches multiples of 16 disparities.
+    nearer = Stereo(width=width, matching=True, max_disparity=10.0)
+    found = matched_depth(seen(board, (0, 0)), seen(moved, (far, near)), nearer, camera)
+    assert np.isfinite(found)[~board].mean() > 0.8
+    assert (found >= 424.0 * 0.05 / 10.0).all()
     gray = np.full((480, 848), 128, np.uint8)
     assert not np.isfinite(matched_depth(gray, gray, sensor, camera)).any()
