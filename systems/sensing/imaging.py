@@ -172,10 +172,10 @@ def time_of_flight_depth(
 
         z' = (z + multipath s)(1 + noise n)
 
-    s is the sag of a concave corner: how far z lies behind the chord between the points at
-    `multipath_angle` to the left and right, or above and below. It is zero on planes. At an edge, a
+    s = z (z / c - 1) is the sag of a concave corner, zero on planes; c is the depth of the chord
+    between the points at `multipath_angle` to the left and right, or above and below. At an edge, a
     pixel reads a depth between those of its neighbors with the probability `mixed_pixels`. A pixel
-    is not measured if z (1 + ambient_spread r) is above `ambient_range`.
+    is not measured if z' (1 + ambient_spread r) is above `ambient_range`.
 
     Args:
         noise, reflectivity: n and r (H, W), drawn from N(0, 1).
