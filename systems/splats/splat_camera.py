@@ -276,6 +276,11 @@ class SplatCamera(LeafSystem):
             "image_time", 1, self._calc_image_time, prerequisites_of_calc={self.time_ticket()}
         )
 
+    @property
+    def distortion(self) -> Distortion | None:
+        """The lens; a pinhole if None."""
+        return self._options["distortion"]
+
     def camera_info(self, context: Context | None = None) -> CameraInfo:
         """Returns the intrinsics of a Context, or the default ones."""
         if context is None:

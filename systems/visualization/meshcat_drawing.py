@@ -22,7 +22,7 @@ from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.collision.distance_field import DistanceField, FieldState
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
-from splatpilot.systems.splats.lens import pixel_slopes
+from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 from splatpilot.systems.splats.moving_bodies import Bodies
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
@@ -163,6 +163,7 @@ class CameraVisualizer(LeafSystem):
         *,
         depth: bool = False,
         path: str = "/splatpilot/vehicle/camera",
+        distortion: Distortion | None = None,
     ):
         """Declares the ports.
 
@@ -172,10 +173,11 @@ class CameraVisualizer(LeafSystem):
             stride: number of images per shown one.
             depth: declares the port `depth_image_32f`, whose points are drawn.
             path: of the camera in Meshcat, below that of the vehicle.
+            distortion: lens of the depth image; a pinhole if None.
         """
         super().__init__()
         self._meshcat, self._period, self._stride = meshcat, period, stride
-        self._path, self._depth = path, depth
+        self._path, self._depth, self._distortion = path, depth, distortion
         self._K = camera_info.intrinsic_matrix()
         self._p_CCorners = draw_frustum(meshcat, path, camera_info, X_BC)
         width, height = camera_info.width(), camera_info.height()
@@ -206,7 +208,13 @@ class CameraVisualizer(LeafSystem):
         """
         path = path or f"{vehicle_path(camera, 'camera')}/vehicle/camera"
         visualizer = CameraVisualizer(
-            meshcat, camera.camera_info(), camera.X_BC(), period, depth=depth, path=path
+            meshcat,
+            camera.camera_info(),
+            camera.X_BC(),
+            period,
+            depth=depth,
+            path=path,
+            distortion=camera.distortion,
         )
         builder.AddNamedSystem(name or f"{camera.get_name()}_visualizer", visualizer)
         for k in range(visualizer.num_input_ports()):
@@ -229,7 +237,7 @@ class CameraVisualizer(LeafSystem):
             image = cast(ImageDepth32F, self.GetInputPort("depth_image_32f").Eval(context))
             depth = np.asarray(image.data)[..., 0]
             step = int(np.ceil(np.sqrt(depth.size / _DEPTH_POINTS)))
-            slopes = pixel_slopes(None, self._K, *depth.shape[::-1])
+            slopes = pixel_slopes(self._distortion, self._K, *depth.shape[::-1])
             z, slopes, colors = (array[::step, ::step] for array in (depth, slopes, rgb / 255))
             valid = np.isfinite(z) & (z > 0)
             p_CQ = z[valid, None] * np.insert(slopes[valid], 2, 1.0, axis=1)

@@ -20,6 +20,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, MovingSpheres, Sphere
 from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.splats.lens import Distortion
 from splatpilot.systems.splats.moving_bodies import MovingBodies, MovingObstacles
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import hover_state
@@ -112,6 +113,21 @@ def test_visualizers_of_two_vehicles_draw_by_forced_publish(meshcat):
     assert position(meshcat, "/splatpilot/b/vehicle") == [1, 0, 1]
     for name in ("picture", "frustum", "depth"):
         assert meshcat.HasPath(f"/splatpilot/b/vehicle/camera/{name}")
+
+
+def test_depth_points_lie_along_the_rays_of_the_lens(meshcat):
+    builder = DiagramBuilder()
+    info = CameraInfo(64, 48, 20.0, 20.0, 32.0, 24.0)
+    scene, lens = uniform_scene([[2.0, 0, 2]], [0.1] * 3), Distortion(model="fisheye")
+    camera = builder.AddNamedSystem("camera", SplatCamera(scene, info, distortion=lens))
+    CameraVisualizer.AddToBuilder(builder, camera, meshcat, depth=True)
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    pose = camera.GetInputPort("body_pose")
+    pose.FixValue(camera.GetMyMutableContextFromRoot(context), RigidTransform())
+    diagram.ForcedPublish(context)
+    points = vertices(meshcat, "/splatpilot/vehicle/camera/depth")
+    np.testing.assert_allclose(points.mean(axis=0), [2, 0, 2], atol=0.1)
 
 
 def test_arrows_are_drawn_on_request(meshcat):
