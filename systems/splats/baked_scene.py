@@ -275,7 +275,7 @@ def _render_views(
     require(0 <= merged_spread < np.inf, "merged_spread", "finite and >= 0 px", merged_spread)
     merged_spread = merged_spread if "color" in names else 0.0
     first, last = rows or (0, height)
-    require(0 <= first < last <= height, "rows", f"in [0, {height}]", rows)
+    require(0 <= first < last <= height, "rows", f"in [0, {height}], ascending", rows)
     K_rows, num_rows = K.copy(), last - first
     K_rows[1, 2] -= first
     lens = {}

@@ -192,8 +192,9 @@ def test_rows_are_those_of_the_whole_image(lens, sky):
             [scene], *CAMERA, [X_WC], backgrounds=[behind], distortion=lens, rows=rows
         )
         assert_equal_views([image[0] for image in batch], part)
-    with pytest.raises(ValueError, match=r"rows must be in \[0, "):
-        scene.render(*CAMERA, X_WC, rows=(3, HEIGHT + 1))
+    for rows in ((3, HEIGHT + 1), (5, 5)):
+        with pytest.raises(ValueError, match=r"rows must be in \[0, .*\], ascending, got"):
+            scene.render(*CAMERA, X_WC, rows=rows)
 
 
 @pytest.mark.parametrize("simd", LEVELS)
