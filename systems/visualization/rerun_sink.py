@@ -23,6 +23,7 @@ from splatpilot.systems.common.drake import connect
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.hypotheses import Hypotheses, num_hypotheses_in
+from splatpilot.systems.splats.lens import Distortion
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
@@ -130,18 +131,23 @@ class RerunSink(LeafSystem):
             ports = {**ports, **{image: camera.GetOutputPort(image) for image in images}}
         sink = RerunSink(path, ports, **options)
         if camera is not None:
-            sink.show_camera(camera.camera_info(), camera.X_BC())
+            sink.show_camera(camera.camera_info(), camera.X_BC(), camera.distortion)
         builder.AddNamedSystem(name, sink)
         for name, port in ports.items():
             connect(builder, port, sink.GetInputPort(name))
         return sink
 
-    def show_camera(self, info: CameraInfo, X_BC: RigidTransform) -> None:
-        """Records the intrinsics of the camera and its pose in the vehicle's body frame."""
+    def show_camera(
+        self, info: CameraInfo, X_BC: RigidTransform, distortion: Distortion | None = None
+    ) -> None:
+        """Records the pose of the camera in the vehicle's body frame, and the intrinsics of a
+        pinhole. Rerun has no lenses: it would draw depth along other rays."""
         q_BC, size = X_BC.rotation().ToQuaternion().wxyz(), [info.width(), info.height()]
         pinhole = self._rr.Pinhole(image_from_camera=info.intrinsic_matrix(), resolution=size)
         transform = self._transform(X_BC.translation(), q_BC)
-        self._statics += [(_CAMERA, transform), (_CAMERA, pinhole)]
+        self._statics.append((_CAMERA, transform))
+        if distortion is None:
+            self._statics.append((_CAMERA, pinhole))
 
     def close(self) -> None:
         """Completes the file; the sink records no more."""

@@ -16,7 +16,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.systems.sensors import CameraInfo
 
 from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.splats.lens import Distortion
+from splatpilot.systems.splats.splat_camera import SplatCamera, empty_scene
 from splatpilot.systems.vehicle.quadrotor import hover_state
 from splatpilot.systems.vehicle.state import StateToPose
 from splatpilot.systems.visualization.rerun_sink import RerunSink
@@ -94,6 +95,22 @@ def test_recording_is_valid_and_holds_everything_on_one_timeline(recording):
     names = columns(recording, "/state/v_WB")["SeriesLines:names"]
     assert names == [["x [m/s]", "y [m/s]", "z [m/s]"]]
     assert columns(recording, "/events")["TextLog:text"] == [["start"], ["goal"]]
+
+
+@pytest.mark.parametrize("lens", [None, Distortion(model="fisheye")])
+def test_only_pinhole_cameras_have_intrinsics(tmp_path, lens):
+    camera = SplatCamera(empty_scene(), CameraInfo(32, 24, 1.0), distortion=lens)
+    builder = DiagramBuilder()
+    builder.AddSystem(camera)
+    builder.ExportInput(camera.GetInputPort("body_pose"), "pose")
+    sink = RerunSink.AddToBuilder(builder, tmp_path / "a.rrd", {}, camera=camera)
+    simulator = Simulator(builder.Build())
+    simulator.get_system().get_input_port().FixValue(simulator.get_context(), RigidTransform())
+    simulator.Initialize()
+    sink.close()
+    found = columns(tmp_path / "a.rrd", "/world/vehicle/camera")
+    assert "Transform3D:translation" in found
+    assert ("Pinhole:image_from_camera" in found) == (lens is None)
 
 
 def test_recordings_of_two_files_are_two_recordings(recording, tmp_path):
