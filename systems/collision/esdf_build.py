@@ -145,16 +145,18 @@ def density_on_grid(
     total = len(touching)
     with Progress(total=total, desc="density of Gaussians", unit="", delay=2.0) as progress:
         for box, n in batches:
-            voxel = np.stack(np.unravel_index(np.arange(box.prod()), box), -1)  # (V, 3)
             # M (first + voxel - mean): a constant for each Gaussian, and a product for all voxels.
             at_first = np.einsum("nij,nj->ni", M[n], first[n] - mean[n]).astype(np.float32)
-            steps = M[n].astype(np.float32) @ voxel.T.astype(np.float32)  # (n, 3, V)
-            squared = np.square(steps + at_first[:, :, None]).sum(axis=1)  # (n, V)
-            value = scene.opacities[n, None] * np.exp(-0.5 * squared)
-            index = first[n].astype(np.intp)[:, None, :] + voxel  # (n, V, 3)
-            used = (squared < _SUPPORT**2) & (index < np.array(shape)).all(axis=-1)
-            flat = np.ravel_multi_index(tuple(index[used].T), shape)
-            np.add.at(density, flat, value[used])
+            for start in range(0, box.prod(), _CHUNK):  # a box may be as large as the grid
+                part = np.arange(start, min(start + _CHUNK, box.prod()))
+                voxel = np.stack(np.unravel_index(part, box), -1)  # (V, 3)
+                steps = M[n].astype(np.float32) @ voxel.T.astype(np.float32)  # (n, 3, V)
+                squared = np.square(steps + at_first[:, :, None]).sum(axis=1)  # (n, V)
+                value = scene.opacities[n, None] * np.exp(-0.5 * squared)
+                index = first[n].astype(np.intp)[:, None, :] + voxel  # (n, V, 3)
+                used = (squared < _SUPPORT**2) & (index < np.array(shape)).all(axis=-1)
+                flat = np.ravel_multi_index(tuple(index[used].T), shape)
+                np.add.at(density, flat, value[used])
             progress.update(len(n))
     return density.reshape(shape)
 

@@ -1,3 +1,5 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.ndimage import label
@@ -57,6 +59,18 @@ def test_density_is_the_sum_of_all_gaussians():
     error = np.abs(density - expected)
     assert np.count_nonzero(error > 1e-5) <= 3
     assert error.max() < 0.003
+
+
+def test_memory_does_not_grow_with_the_size_of_a_gaussian():
+    scene = gaussians([[8.0, 8.0, 8.0]], [[1.0, 0.0, 0.0, 0.0]], [[10.0] * 3], [0.8])
+    tracemalloc.start()
+    density = density_on_grid(scene, np.zeros(3), (160, 160, 160), VOXEL)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 400e6
+    assert density[80, 80, 80] == pytest.approx(0.8, abs=1e-4)
+    far = 0.5 * 3 * (7.95 / 10) ** 2
+    assert density[0, 0, 0] == pytest.approx(0.8 * np.exp(-far), abs=1e-4)
 
 
 @pytest.mark.parametrize(("spacing", "opacity"), [(0.06, 0.9), (0.04, 0.5), (0.1, 0.95)])
