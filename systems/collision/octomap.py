@@ -15,7 +15,7 @@ from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy, grid_shape
 from splatpilot.systems.common.readers import LFS_ERROR, LFS_POINTER, require_file
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import errors_about, require
 
 _DEPTH = 16  # levels of children below the root
 _FREE, _OCCUPIED, _INNER = 1, 2, 3  # the two bits of a child
@@ -110,7 +110,8 @@ def read_octomap(path: str | Path) -> Octomap:
     links = _links(masks)
     size = f"{path}: size of the octree"
     require(2 * len(links) == len(tree) > 0, size, f"{2 * len(links)} bytes", len(tree))
-    corners, sizes, occupied = _leaves(masks, links)
+    with errors_about(path):
+        corners, sizes, occupied = _leaves(masks, links)
     nodes = len(masks) + len(sizes)
     require(nodes == count, f"{path}: number of nodes", f"size = {count}", nodes)
     return Octomap(resolution, corners, sizes, occupied)
@@ -139,7 +140,8 @@ def _leaves(masks: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarra
     parent, number = links >> 3, links & 7
     corner = np.zeros((len(masks), 3), dtype=np.int64)
     corner[0] = -(2 ** (_DEPTH - 1))
-    level = np.zeros(len(masks), dtype=np.int64)
+    level = np.full(len(masks), _DEPTH)
+    level[0] = 0
     bits = np.array([0, 1, 2])
     nodes = np.array([0])
     for depth in range(1, _DEPTH):
@@ -149,6 +151,7 @@ def _leaves(masks: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarra
         level[nodes] = depth
         step = 2 ** (_DEPTH - depth) * (number[nodes, None] >> bits & 1)
         corner[nodes] = corner[parent[nodes]] + step
+    require(level.max() < _DEPTH, "depth of the octree", f"at most {_DEPTH}", "more")
     child = masks[:, None] >> (2 * np.arange(8)) & 3  # (inner nodes, 8)
     node, octant = np.nonzero((child == _FREE) | (child == _OCCUPIED))
     size = 2 ** (_DEPTH - 1 - level[node])

@@ -91,6 +91,7 @@ def test_boxes_too_large_or_empty_are_refused(path):
     [
         (lambda c: c[:-2], "octree must be 32 bytes, got 30"),
         (lambda c: c + b"\0\0", "octree must be 32 bytes, got 34"),
+        (lambda _: content([node(c0=INNER)] * 16 + [node(c0=FREE_LEAF)], 18), "at most 16, got"),
         (lambda c: c.replace(b"size 20", b"size 21"), "number of nodes must be .* 21, got 20"),
         (lambda c: c.replace(b"res 0.5\n", b""), "header must have id, size and res"),
         (lambda c: c.replace(b"res 0.5", b"res -1"), "res must be .* got -1.0"),
