@@ -156,7 +156,7 @@ class Esdf:
 
         Occupied and unknown voxels hold minus the distance to free space, so that the gradient
         leads out of them. At corners where two surfaces meet the interpolant is up to 0.75 voxel
-        too large.
+        too large, within half a voxel of the field's faces up to 1.25.
         """
         states, size = self.states, self.voxel_size
         to_faces = [np.minimum(i + 0.5, i[::-1] + 0.5) for i in map(np.arange, self.shape)]
