@@ -15,7 +15,7 @@ class lcmt_depth_grid(object):
     first. Encodings: DEPTH [m] along the optical axis, RANGE [m] along the ray, PROXIMITY, which is 1 - range / max_range.
     min_range and max_range [m] are limits of the sensor; values farther or not measured are max_range. num_values is
     width * height.
-    header: utime is when the sensor exposed, frame_name names the sensor. session: a random number of the sender.
+    header: utime is when the sensor exposed, frame_name is "policy_camera". session: a random number of the sender.
     """
 
     __slots__ = ["header", "session", "width", "height", "min_range", "max_range", "encoding", "num_values", "values"]
