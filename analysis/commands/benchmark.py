@@ -69,8 +69,8 @@ def _speed(text: str) -> float:
     ),
     cli.Option(
         "--sweep [A:]FIELD=1,2,3",
-        "fly policy A, or without A all scenarios, with each of these values of a field; several "
-        "sweeps fly all combinations (repeatable)",
+        "fly policy A, or without A all scenarios, with each of these values of a field "
+        "(repeatable); several fields of scenarios, or A:FIELD=1,2:FIELD=3,4, fly all combinations",
         action="append",
         default=[],
         resolve=_check_sweep,
