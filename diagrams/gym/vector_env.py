@@ -72,8 +72,8 @@ class VectorFlightEnv(VectorEnv):
     infos of `reset` within rounding, and do not depend on the number of threads.
 
     Each flight is drawn from a `WorldPool`, whose worlds are made at the beginning, each with 64
-    flights: starts, goals and values of the scenario's distributions. Environment i of a `reset`
-    with the seed s draws its flights from the seed s + i.
+    flights (4 with random appearance): starts, goals and values of the scenario's distributions.
+    Environment i of a `reset` with the seed s draws its flights from the seed s + i.
 
     When a flight ends, infos have its `outcome` and `is_success`, by environments, and masks of
     the environments that have them, `_outcome` and `_is_success`. Then and when the next begins,
