@@ -22,7 +22,7 @@ def _point(text: str) -> list[float]:
 @cli.command(
     "scene scale",
     cli.path_option("scene", "a scene folder or a file of Gaussians", "scene", "gaussians"),
-    cli.out_option("scene folder, or PLY, glTF or USD file, to write"),
+    cli.out_option("scene folder, or PLY, SPZ, glTF or USD file, to write"),
     cli.Option("--up", "axis of a file that points up (z)", choices=_AXES),
     cli.Option(
         "--floor X,Y,Z",
@@ -49,8 +49,8 @@ def _point(text: str) -> list[float]:
 )
 def scale(options: argparse.Namespace) -> None:
     """Writes a scene again with all lengths times one factor, so that scenes of photographs, whose
-    scale is unknown, can be flown in. Of a file of Gaussians it writes a PLY, glTF or USD file in
-    meters with z up (of glTF: y)."""
+    scale is unknown, can be flown in. Of a file of Gaussians it writes a PLY, SPZ, glTF or USD
+    file in meters with z up (of glTF: y)."""
     if bool(options.between) == (options.distance is None):
         raise ValueError("--between and --distance belong together: two points and the meters")
     given = options.factor, options.height, options.up

@@ -65,8 +65,8 @@ class RescaleSummary:
 def rescale_file(
     file: Path, out: Path, factor: float, up: str, floor: Sequence[ArrayLike]
 ) -> RescaleSummary:
-    """Writes the Gaussians of a file as PLY, glTF or USD, in meters. Its axis `up` becomes z, or y
-    of glTF; the plane of three points (3,) of `floor`, if given, becomes z = 0."""
+    """Writes the Gaussians of a file as PLY, SPZ, glTF or USD, in meters. Its axis `up` becomes z,
+    or y of glTF; the plane of three points (3,) of `floor`, if given, becomes z = 0."""
     suffix = out.suffix.lower()
     require(suffix in WRITTEN, f"{out}: the suffix", f"one of {', '.join(WRITTEN)}", repr(suffix))
     if out.exists():
