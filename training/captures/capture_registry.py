@@ -1,5 +1,6 @@
 """Capture formats by name."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -8,7 +9,7 @@ from pathlib import Path
 from splatpilot.diagrams.worlds.scene_folder import SceneMetadata
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.registry import Registry
-from splatpilot.systems.common.validation import errors_about
+from splatpilot.systems.common.validation import errors_about, require
 from splatpilot.training.captures import (
     colmap,
     nerfstudio,
@@ -19,7 +20,7 @@ from splatpilot.training.captures import (
     tum,
 )
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
+from splatpilot.training.captures.capture_config import CONFIG_FILE, CaptureConfig, complete_config
 from splatpilot.training.captures.refine_poses import refined_capture
 from splatpilot.training.captures.up_and_scale import move_origin
 
@@ -90,6 +91,8 @@ def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Captu
     if given.cache:  # The same from any working directory.
         given = replace(given, cache=str(Path(given.cache).absolute()))
     config = complete_config(path, given)
+    if config.kind != given.kind:
+        _require_imported(config.kind, path / CONFIG_FILE)
     capture = (CAPTURES.find(config.kind) if config.kind else _recognize(path)).read(path, config)
     if not isinstance(capture, Capture):
         raise ValueError(
@@ -99,6 +102,14 @@ def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Captu
     if config.refine_poses:
         capture = refined_capture(capture, path, config)
     return replace(capture, folder=str(path.absolute()), config=given)
+
+
+def _require_imported(kind: str, file: Path) -> None:
+    """Checks that a format which a file names needs no import."""
+    module = kind.partition(":")[0]
+    valid = ":" not in kind or module in sys.modules
+    remedy = f"put --import {module} in front of the command"
+    require(valid, f"{file}: kind", "of an imported module", repr(kind), remedy)
 
 
 def _recognize(path: Path) -> CaptureFormat:
@@ -120,5 +131,6 @@ def read_scene_capture(scene: Path, metadata: SceneMetadata) -> Capture:
         )
     with errors_about(f"{file}: capture_settings"):
         config = load_config(CaptureConfig(), overrides=metadata.capture_settings)
+    _require_imported(config.kind, file)
     config.origin = metadata.origin
     return read_capture(metadata.capture, config)

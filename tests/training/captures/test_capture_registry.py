@@ -1,13 +1,19 @@
+import importlib
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from splatpilot.diagrams.worlds.scene_folder import SceneMetadata
 from splatpilot.systems.common.config import load_config
 from splatpilot.training.captures import capture_registry as module
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.capture_registry import read_capture, register_capture
+from splatpilot.training.captures.capture_registry import (
+    read_capture,
+    read_scene_capture,
+    register_capture,
+)
 
 _PACKAGE = """
 import cv2
@@ -71,6 +77,20 @@ def test_format_of_another_package(folder, tmp_path):
     }.items():
         with pytest.raises(ValueError, match=message):
             read_capture(folder, CaptureConfig(kind=kind))
+
+
+def test_files_name_formats_of_imported_modules_alone(folder):
+    (folder / "capture.yaml").write_text("kind: pairs:PAIR\n")
+    scene = SceneMetadata(capture=str(folder), capture_settings=["kind=pairs:PAIR"])
+    for read, file in (
+        (lambda: read_capture(folder), "capture.yaml"),
+        (lambda: read_scene_capture(folder, scene), "scene.yaml"),
+    ):
+        with pytest.raises(ValueError, match=f"{file}: kind must be .*; put --import pairs in"):
+            read()
+    assert "pairs" not in sys.modules
+    importlib.import_module("pairs")
+    assert len(read_capture(folder)) == len(read_scene_capture(folder, scene)) == 2
 
 
 def test_registered_formats_are_listed(folder):
