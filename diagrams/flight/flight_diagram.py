@@ -559,6 +559,8 @@ def AddMeshcat(
     sources |= {"command": parts.command, parts.decision.get_name(): parts.decision}
     if (selector := _find(builder, parts, "selector")) is not None:
         sources["waypoint"] = selector.GetOutputPort("waypoint")
+    valid = "waypoint" in sources or "waypoint" not in draw
+    require(valid, "draw", "without waypoint for a policy that decides none", "waypoint")
     vehicle = [name for name in draw if name not in ("depth", "frustum", "limits")]
     FlightVisualizer.AddToBuilder(
         builder,

@@ -220,7 +220,8 @@ class CorpusConfig(Config):
 class Corpus:
     """The samples of a folder, by the names of their shards. Images are mapped into memory."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: str | Path) -> None:
+        folder = Path(folder)
         require_corpus(folder)
         self.folder = folder
         self.config = load_config(CorpusConfig(), folder / CONFIG)

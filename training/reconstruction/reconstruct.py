@@ -23,6 +23,8 @@ from splatpilot.diagrams.worlds.scene_folder import (
 from splatpilot.diagrams.worlds.splits import choose_split, part_digests, source_digest
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.observations import Observations
+from splatpilot.systems.common.config import dump_config
+from splatpilot.systems.common.files import write_text
 from splatpilot.systems.common.processes import one_torch_thread
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
@@ -52,6 +54,7 @@ from splatpilot.training.reconstruction.views import (
     learn_background,
 )
 
+SETTINGS = "reconstruct.yaml"
 _MAX_NAMED = 10  # frames in a warning
 
 
@@ -191,6 +194,7 @@ def reconstruct(
         split=split,
         source_digest=source,
     )
+    write_text(out / SETTINGS, dump_config(config))
     if checkpoint is not None:
         checkpoint.remove()
     warnings = (*capture.dropped, *without_depth, *warnings)

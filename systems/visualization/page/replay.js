@@ -2,7 +2,7 @@
 // speed and clearance, all at the time of one slider.
 //
 // Keys: space plays and pauses, arrows step, l loops, 1 2 3 choose the view, d switches color and
-// depth, u the hatched surfaces before unobserved space.
+// depth, u the plain surfaces in front of unobserved space.
 "use strict";
 
 class Replay {

@@ -2,7 +2,7 @@
 // ruler.
 //
 // Keys: 1 shows the scene from above; r, f, b and u switch the ruler, the distances, Gaussians
-// beyond the bounds and the hatched surfaces before unobserved space.
+// beyond the bounds and the plain surfaces in front of unobserved space.
 "use strict";
 
 class SceneView {

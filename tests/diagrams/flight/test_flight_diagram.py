@@ -323,6 +323,9 @@ def test_meshcat_draws_on_request_and_gives_controls_of_teleop(post_world):
     scenario.policy = policy_named("reactive")
     BuildFlightDiagram(scenario, post_world, meshcat, draw=["frustum"])
     assert meshcat.HasPath("/splatpilot/vehicle/policy_camera/frustum")
+    scenario.policy = policy_named("diffaero")
+    with pytest.raises(ValueError, match="draw must be without waypoint"):
+        BuildFlightDiagram(scenario, post_world, meshcat, draw=["waypoint"])
     scenario.policy = policy_named("teleop")
     diagram = BuildFlightDiagram(scenario, post_world, meshcat)
     meshcat.SetSliderValue("up (arrows)", 2.0)

@@ -12,6 +12,7 @@ from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
 from splatpilot.diagrams.worlds.splits import part_digests, source_digest
 from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.common.config import load_config
 from splatpilot.systems.splats.splat_files import read_ply
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture
@@ -37,6 +38,8 @@ def test_room_end_to_end(tmp_path):
     assert len(of_scene) == summary.gaussians < len(world.gaussians)
     assert "TartanAir V1" in metadata.provenance and len(metadata.gains) == 12
     assert metadata.split == "train"
+    settings = load_config(ReconstructConfig(), tmp_path / "scene" / "reconstruct.yaml")
+    assert (settings.iterations, settings.voxel_size) == (0, 0.1)
 
     # It collides like the room: 6 x 3 x 2.5 m, not all of it seen.
     assert 30 < metadata.observed_free_volume <= 6 * 3 * 2.5 * 1.05
