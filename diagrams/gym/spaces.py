@@ -247,11 +247,15 @@ def require_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[np.float64]
 
 def require_options(options: Mapping[str, Any], *others: str) -> dict[str, list[float]]:
     """Returns `start` and `goal` of a reset's options; raises ValueError for names besides these
-    and `others`."""
+    and `others`, and unless both are vectors."""
     known = *others, "start", "goal"
     for name in options:
         require(name in known, "options", f"of {', '.join(known)}", repr(name))
-    return {name: list(options[name]) for name in known[-2:] if name in options}
+    points = {name: np.asarray(options[name]) for name in known[-2:] if name in options}
+    for name, point in points.items():
+        valid = point.ndim == 1 and point.dtype.kind in "iuf"
+        require(valid, name, "three finite numbers x, y, z [m]", options[name])
+    return {name: point.tolist() for name, point in points.items()}
 
 
 def decisions(

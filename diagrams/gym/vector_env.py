@@ -191,9 +191,11 @@ class VectorFlightEnv(VectorEnv):
         rows = np.flatnonzero(mask)
         flights = None
         if "flight" in options:
-            flights = np.broadcast_to(np.asarray(options["flight"], int), rows.shape)
-            condition = f"in [0, {len(self.pool)})"
-            require(self._in_pool(flights), "flight", condition, flights.tolist())
+            flights = np.asarray(options["flight"])
+            valid = flights.shape in ((), rows.shape) and flights.dtype.kind in "iu"
+            condition = f"one or {len(rows)} in [0, {len(self.pool)})"
+            require(valid and self._in_pool(flights), "flight", condition, flights.tolist())
+            flights = np.broadcast_to(flights, rows.shape)
         self._begun[rows] = False  # also if this fails
         self._begin(rows, flights, points)
         self._begun[rows] = True

@@ -363,8 +363,10 @@ def test_invalid_steps_and_resets_are_errors(post_world):
     for actions in (np.full((2, 3), np.nan), np.full((2, 3), 1.1), np.zeros(3)):
         with pytest.raises(ValueError, match="action must be"):
             envs.step(actions)
-    invalid = {"reset_mask": [True], "flight": 64, "options": 1}
-    for name, value in invalid.items():
+    invalid = [("reset_mask", [True]), ("options", 1)]
+    invalid += [("flight", flight) for flight in (64, 1.5, [0, 1, 2], [[0, 1]])]
+    invalid += [("goal", goal) for goal in (3.0, "abc", np.zeros((3, 3)))]
+    for name, value in invalid:
         with pytest.raises(ValueError, match=f"{name} must be"):
             envs.reset(options={name: value})
     envs.config.reward = lambda transition: 1.0
