@@ -86,9 +86,10 @@ def empty_meshcat(background: Background) -> Meshcat:
     return meshcat
 
 
-def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
-    """Returns a Meshcat with goal, distance field and background, seen from above the start."""
-    meshcat = empty_meshcat(world.background)
+def open_meshcat(scenario: Scenario, world: World, meshcat: Meshcat | None = None) -> Meshcat:
+    """Returns a Meshcat, by default a new one with the background of the world, with goal and
+    distance field, seen from above the start."""
+    meshcat = meshcat or empty_meshcat(world.background)
     p_WG = goal_position(scenario, world)
     draw_goal(meshcat, "/splatpilot/goal", p_WG, scenario.goal_radius)
     draw_distance_slice(meshcat, "/splatpilot/distance_slice", world.distance_field, float(p_WG[2]))

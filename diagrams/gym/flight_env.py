@@ -133,7 +133,7 @@ class FlightEnv(gymnasium.Env):
         camera = self.render_mode is not None
         parts = AddFlight(builder, scenario, world, policy=policy, camera=camera, logs=False)
         if self.render_mode == "human":
-            self.meshcat = self.meshcat or open_meshcat(scenario, world)
+            self.meshcat = open_meshcat(scenario, world, self.meshcat)
             AddMeshcat(builder, parts, self.meshcat)
         ExportFlight(builder, parts)
         simulator = Simulator(builder.Build())
@@ -143,12 +143,13 @@ class FlightEnv(gymnasium.Env):
         return _BuiltFlight(parts, simulator)
 
     def _take_flight(self, scenario: Scenario, world: World) -> None:
-        """Takes the flight of a world, or a new one if noise differs from flight to flight."""
+        """Takes the flight of a world, or a new one if noise differs from flight to flight, or to
+        draw its world."""
         flight = self._flights.get(id(world)) or self._build(scenario, world)
-        if only_start_is_random(self.config.scenario) and id(world) not in self._flights:
+        is_kept = only_start_is_random(self.config.scenario) and self.render_mode != "human"
+        if is_kept and id(world) not in self._flights:
             self._flights[id(world)] = flight
-            is_native = self._native and self.render_mode != "human"
-            if is_native and can_fly_natively(self.config, world):
+            if self._native and can_fly_natively(self.config, world):
                 context = flight.simulator.get_mutable_context()
                 flight.native = NativeFlight(self.config, flight.parts, context)
         self._flight, self.parts, self.simulator = flight, flight.parts, flight.simulator

@@ -230,6 +230,19 @@ def test_human_mode_draws_in_meshcat(post_world):
     assert env.meshcat and env.meshcat.HasPath("/splatpilot/vehicle")
 
 
+def test_human_mode_draws_the_world_and_the_goal_of_each_flight():
+    env, sizes = FlightEnv(SMALL, num_worlds=2, render_mode="human"), {}
+    for seed in range(4):
+        env.reset(seed=seed)
+        assert env.meshcat
+        size = len(env.meshcat._GetPackedObject("/splatpilot/scene"))
+        assert sizes.setdefault(env.parts.world.source[1], size) == size
+    assert len(set(sizes.values())) == 2
+    goal = env.meshcat._GetPackedTransform("/splatpilot/goal")
+    env.reset(options={"goal": env.parts.world.p_WG - [0.5, 0.0, 0.0]})
+    assert env.meshcat._GetPackedTransform("/splatpilot/goal") != goal
+
+
 @pytest.mark.parametrize("action", ["command", "acceleration", "velocity", "waypoint"])
 def test_native_code_flies_as_the_simulator_does(action, post_world):
     names = ["full_state", "goal", "obstacle", "depth_m"]
