@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import Value
+from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, LeafSystem, State
 
 from splatpilot.diagrams.flight.blocks import DECISIONS
@@ -20,7 +20,7 @@ from splatpilot.diagrams.gym.spaces import (
     require_actions,
 )
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.common.drake import vector_input
+from splatpilot.systems.common.drake import optional_input, vector_input
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.base import CHANNELS
 
@@ -35,7 +35,7 @@ class GymPolicy(LeafSystem):
     .. pydrake_system::
 
         name: GymPolicy
-        input_ports: [state, goal, (images)]
+        input_ports: [state, goal, (images), moving (with obstacle)]
         output_ports: [(action)]
 
     The inputs are ``state`` (13), ``goal`` (3), p_WG [m], and the observed images. The output has
@@ -65,6 +65,8 @@ class GymPolicy(LeafSystem):
         self._size = DECISIONS[config.action]
         self.DeclareVectorInputPort("state", 13)
         self.DeclareVectorInputPort("goal", 3)
+        if self._field is not None:
+            self.DeclareAbstractInputPort("moving", AbstractValue.Make(object()))
         size = config.camera.width, config.camera.height
         for port in dict.fromkeys(IMAGES[name] for name in self._names if name in IMAGES):
             self.DeclareAbstractInputPort(port, Value(cast(Any, CHANNELS[port][0])(*size)))
@@ -90,8 +92,10 @@ class GymPolicy(LeafSystem):
         config = self._config
         states, p_WG = (vector_input(self, name, context)[None] for name in ("state", "goal"))
         vehicles = Vehicles(states, p_WG, np.full(1, np.nan), np.zeros((1, 3)))
-        if self._field is not None:
-            sample = self._field.query(states[:, :3])
+        if (field := self._field) is not None:
+            if bodies := optional_input(self, "moving", context):
+                field = bodies.among(field, bodies.time)
+            sample = field.query(states[:, :3])
             vehicles = Vehicles(states, p_WG, sample.distance, sample.gradient)
         seen: dict[str, Any] = {n: v[0] for n, v in observe(self._names, vehicles).items()}
         for name in self._names:

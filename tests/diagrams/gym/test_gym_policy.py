@@ -7,20 +7,24 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.gym.flight_env import FlightEnv
 from splatpilot.diagrams.gym.gym_policy import GymPolicy
 from splatpilot.diagrams.gym.spaces import FlightEnvConfig
+from splatpilot.diagrams.worlds.moving_spheres import MovingSphere
+
+BALL = MovingSphere(radius=0.3, waypoints=[[4.0, 1.5, 2.0], [2.0, 1.5, 2.0]])
 
 
 @pytest.mark.parametrize(
-    ("observation", "action", "delay"),
+    ("observation", "action", "fields"),
     [
-        (["state", "goal", "obstacle"], "velocity", []),
-        (["depth", "goal"], "acceleration", []),
-        (["rgb", "depth_m", "state"], "waypoint", []),
-        ("state", "command", [0.06, 0.06]),
-        ("state", "waypoint", [0.06, 0.06]),
+        (["state", "goal", "obstacle"], "velocity", {}),
+        ("obstacle", "velocity", {"moving": {"ball": BALL}}),
+        (["depth", "goal"], "acceleration", {}),
+        (["rgb", "depth_m", "state"], "waypoint", {}),
+        ("state", "command", {"decision_delay": [0.06, 0.06]}),
+        ("state", "waypoint", {"decision_delay": [0.06, 0.06]}),
     ],
 )
-def test_its_flight_is_that_of_the_environment(observation, action, delay, post_world):
-    scenario = Scenario(timeout=2.0, decision_delay=delay)
+def test_its_flight_is_that_of_the_environment(observation, action, fields, post_world):
+    scenario = Scenario(timeout=2.0, **fields)
     size = 4 if action == "command" else 3
     env = FlightEnv(scenario, world=post_world, observation=observation, action=action)
 
