@@ -94,6 +94,8 @@ class GapConfig(Config):
 
     def check(self) -> None:
         require_field(self, "policies", self.policies, "one policy or more")
+        last = len(MONTE_CARLO_SEEDS) // self.viewpoints - 1
+        require_field(self, "seed", 0 <= self.seed <= last, f"in [0, {last}]")
 
 
 class View(NamedTuple):
@@ -162,7 +164,8 @@ def run(
 def _policy(name: str, speed: float) -> Policy:
     """Makes a policy that sees a color or a depth image."""
     config = policy_named(name, speed)
-    policy = POLICIES.entry_for(config).build(config, None, Scenario())  # type: ignore[arg-type]
+    build: Any = POLICIES.entry_for(config).build
+    policy = build(config, None, Scenario()) if hasattr(config, "camera") else None
     known = isinstance(policy, Policy) and policy.image in ("color_image", "depth_image_32f")
     require(known, "policies", "policies with the color or depth of a camera", repr(name))
     assert isinstance(policy, Policy)  # for type checkers

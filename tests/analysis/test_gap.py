@@ -149,10 +149,19 @@ def test_the_interval_is_of_viewpoints():
     assert -0.8 < low < -0.6 and -0.4 < high < -0.2  # 1.96 sqrt(0.25 / 20) = 0.22
 
 
-def test_policies_without_a_camera_are_refused(room, set_fields, capsys):
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        ("policies=[straight]", "with the color or depth of a camera, got 'straight'"),
+        ("policies=[planner]", "with the color or depth of a camera, got 'planner'"),
+        ("seed=25000", "seed must be in [0, 24999], got 25000"),
+        ("seed=-1", "seed must be in [0, 24999], got -1"),
+    ],
+)
+def test_invalid_fields_are_errors(field, message, room, set_fields, capsys):
     words = ["gap", str(room.scene("room")), "--out", str(room.folder / "out")]
-    assert main([*words, *set_fields("policies=[straight]")]) == 1
-    assert "with the color or depth of a camera, got 'straight'" in capsys.readouterr().err
+    assert main([*words, *set_fields(field)]) == 1
+    assert message in capsys.readouterr().err
 
 
 def test_two_scenes_of_one_name_are_refused(tmp_path):
