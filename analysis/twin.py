@@ -33,7 +33,7 @@ from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.files import write_csv
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.common.validation import Config, bounded, require
+from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.training.captures.render import RECIPE, rendered_world
 
@@ -77,6 +77,9 @@ class TwinConfig(Config):
     # Generated scenarios that are flown with as many seeds, as another prediction.
     control: list[str] = field(default_factory=lambda: ["P02", "P04"])
 
+    def check(self) -> None:
+        require_field(self, "policies", self.policies, "one policy or more")
+
 
 class Route(NamedTuple):
     """A start and a goal [m], in the world frame of the scene."""
@@ -93,6 +96,9 @@ def run(
     of `twin.csv`, see `predictions`."""
     config.validate()
     by_speed = policies_by_speed(config.policies)
+    if config.control:  # Its errors are found before hours of flights.
+        for speed, policies in by_speed.items():
+            StudyConfig(config.control, policies, [speed], seeds=config.routes).load_scenarios()
     given, texts = twin_scenarios(scenes, config)
     rows, generated = [], []
     for speed, policies in by_speed.items():

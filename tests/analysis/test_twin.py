@@ -7,7 +7,7 @@ from scipy.stats import spearmanr
 
 from splatpilot.analysis import twin
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.twin import cohen_kappa, predictions, rank_correlations
+from splatpilot.analysis.twin import TwinConfig, cohen_kappa, predictions, rank_correlations
 from splatpilot.systems.common.config import dump_config
 from splatpilot.training.captures.render import RECIPE, RenderConfig, RenderedWorld
 from tests.analysis.conftest import SIZE
@@ -55,6 +55,20 @@ def test_rank_correlations_and_kappa():
     first = np.repeat([1, 1, 0, 0], [20, 5, 10, 15])
     second = np.repeat([1, 0, 1, 0], [20, 5, 10, 15])
     assert cohen_kappa(first, second) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"policies": []}, "policies must be one policy or more"),
+        ({"routes": 101}, r"seeds of split dev must be in \[1, 100\], got 101"),
+        ({"control": ["P99"]}, "there is no scenario 'P99'"),
+    ],
+)
+def test_invalid_fields_are_errors_before_anything_is_flown(fields, message, tmp_path):
+    config = TwinConfig(**{"policies": ["straight"]} | fields)
+    with pytest.raises(ValueError, match=message):
+        twin.run(scenes=[tmp_path / "scene"], out=tmp_path / "out", config=config)
 
 
 def test_policies_fly_the_same_routes_in_scene_and_mesh(opengl, room, tmp_path, capsys):
