@@ -352,24 +352,33 @@ def plugin_digests(scenarios: Iterable[Scenario]) -> dict[str, str]:
     return {f"source of {name}": _source_digest(name) for name in sorted(packages - _KNOWN)}
 
 
-def source_digest(function: Callable[..., Any]) -> str:
+def source_digest(function: Callable[..., Any], within: tuple[Any, ...] = ()) -> str:
     """Returns a digest of the source of a function or callable object, or else of its name, and of
-    the values that it holds as a closure, as defaults, or as a `functools.partial`."""
-    code = function if hasattr(function, "__code__") else type(function)
+    the values that it holds as a closure, as defaults, as attributes of its object, or as a
+    `functools.partial`; functions that it is `within` are not followed again."""
+    code = function if _has_source(function) else type(function)
     held: list[Any] = [*(getattr(function, "__defaults__", None) or ())]
     held += [cell.cell_contents for cell in getattr(function, "__closure__", None) or ()]
+    owner = getattr(function, "__self__", None if code is function else function)
+    held += [value for _, value in sorted(getattr(owner, "__dict__", {}).items())]
     if isinstance(function, partial):
-        code, held = function.func, [*function.args, *sorted(function.keywords.items())]
+        held += [function.func, *function.args, *sorted(function.keywords.items())]
     try:
         text = inspect.getsource(code)
     except (OSError, TypeError):
         text = getattr(code, "__qualname__", repr(code))
-    return hashlib.sha256("\n".join([text, *map(_described, held)]).encode()).hexdigest()[:16]
+    parts = [text, *(_described(value, (*within, function)) for value in held)]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
-def _described(value: Any) -> str:
-    text = source_digest(value) if hasattr(value, "__code__") else repr(value)
+def _described(value: Any, within: tuple[Any, ...]) -> str:
+    is_new = _has_source(value) and value not in within
+    text = source_digest(value, within) if is_new else repr(value)
     return type(value).__qualname__ if " at 0x" in text else text  # An address is of one process.
+
+
+def _has_source(value: Any) -> bool:
+    return isinstance(value, type) or hasattr(value, "__code__")
 
 
 def _source_digest(package: str) -> str:

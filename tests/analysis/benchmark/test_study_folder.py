@@ -1,6 +1,7 @@
 import json
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from splatpilot.analysis.benchmark.study_folder import (
     input_digests,
     keep_inputs,
     plugin_digests,
+    source_digest,
 )
 from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.flight.scenario import Scenario
@@ -20,6 +22,29 @@ from splatpilot.systems.common.provenance import program
 from splatpilot.systems.policies import checkpoint
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
+
+
+class Maker:
+    def __init__(self, gain):
+        self.gain = gain
+
+    def make(self, scenario, world):
+        return self.gain
+
+    __call__ = make
+
+
+@pytest.mark.parametrize("held", [lambda m: m, lambda m: m.make, lambda m: partial(m.make, 1)])
+def test_digests_of_functions_follow_the_values_of_their_object(held):
+    first, again, other = (source_digest(held(Maker(gain))) for gain in (1.0, 1.0, 2.0))
+    assert first == again != other
+
+
+def test_digests_of_recursive_functions_end():
+    def make(depth):
+        return make(depth - 1) if depth else None
+
+    assert len(source_digest(make)) == 16
 
 
 @pytest.mark.parametrize("row", [[1, 2], 3, {}, {"success": True, "outcome": "goal"}])
