@@ -110,11 +110,14 @@ class FlightEnv(gymnasium.Env):
         self._ended = True
         world = self._find_world(self.config.scenario)
         self._take_flight(self.config.scenario, world)
-        ports = self.parts.measured
-        names = self.config.observation_names()
-        self._spaces = {n: _port_space(ports[n]) for n in names if n in ports}
-        self.observation_space = observation_space(self.config, self._spaces, ports)
+        self._spaces, self.observation_space = self._find_spaces()
         self.action_space = action_space(self.config)
+
+    def _find_spaces(self) -> tuple[dict[str, Box], gymnasium.Space[Any]]:
+        """Returns the spaces of observed outputs of sensors, and that of all observations."""
+        ports, names = self.parts.measured, self.config.observation_names()
+        spaces = {n: _port_space(ports[n]) for n in names if n in ports}
+        return spaces, observation_space(self.config, spaces, ports)
 
     def _find_world(self, scenario: Scenario) -> World:
         if self._world is not None:
@@ -182,6 +185,8 @@ class FlightEnv(gymnasium.Env):
             scenario.validate()
         world = self._find_world(replace(base, seed=world_seed))
         self._take_flight(scenario, world)
+        same = not self._spaces or self._find_spaces()[0] == self._spaces
+        require(same, "sensors of the scenario", "those of the observations", "others")
         context = self.simulator.get_mutable_context()
         if only_start_is_random(base):
             world = self.parts.world  # with moving obstacles

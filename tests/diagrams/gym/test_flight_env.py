@@ -195,6 +195,15 @@ def test_invalid_arguments_and_options_are_errors(fields, options, error, messag
         env.reset(seed=0, options=options)
 
 
+def test_scenarios_without_an_observed_sensor_are_refused():
+    scenario = replace(SMALL, sensors={"imu": Imu()})
+    env = FlightEnv(scenario, observation="imu_accelerometer")
+    for options in ({"scenario": SMALL}, {}):
+        with pytest.raises(ValueError, match=r"observation must be one of .* got 'imu_acc"):
+            env.reset(options=options)
+    assert env.observation_space.contains(env.reset(options={"scenario": scenario})[0])
+
+
 def test_rewards_are_replaceable(post_world):
     env = FlightEnv(Scenario(), world=post_world, reward=lambda t: t.next_states[:, 2])
     env.reset(seed=0)
