@@ -191,7 +191,8 @@ class LibraryConfig(Config):
 
 def world_source(library: LibraryConfig, seed: int, index: int) -> WorldSource:
     """Returns the world `index`, 0 to 999, of a library whose kinds take turns and whose seeds
-    count up. Corpora of different seeds have no generated world in common."""
+    count up. Corpora of different seeds to train with have no generated world in common; held-out
+    ones have the same."""
     if not 0 <= index < SEEDS_PER_RUN:
         raise ValueError(
             f"a corpus has at most {SEEDS_PER_RUN} worlds; collect more with another seed"

@@ -292,7 +292,8 @@ def run[Config: CorpusTraining](
     Writes to `out`: `stage_1` and `stage_2`, see `train.run`; `corpora`, links to those of
     `config`, with the recovery samples; `flights`, files of up to `flights` flights in a world;
     `recovery.yaml`, see `RecoveryFlights`; `recovery.json`, counts, which is returned. `flown_by`,
-    a policy or file of weights, flies instead of a first stage, through its own camera."""
+    a policy or file of weights, flies instead of a first stage; students and policies of RGB see
+    by the camera of the corpora, others by their own."""
     for name, value in (("flights", flights), ("jobs", jobs)):
         require(value >= 1, f"--{name}", "at least 1", value)
     # Missing inputs are refused before anything is written.
