@@ -218,7 +218,7 @@ def likely_pairs(similarity: NDArray[np.float64], partners: int) -> list[tuple[i
     for a, b in pairs:
         others[a, b] = others[b, a] = -np.inf
     for a, row in enumerate(others):
-        for b in np.argsort(-row, kind="stable")[: partners - 2 * near]:
+        for b in np.argsort(-row, kind="stable")[: max(partners - 2 * near, 0)]:
             if np.isfinite(row[b]):
                 pairs.add((min(a, int(b)), max(a, int(b))))
     return sorted(pairs)

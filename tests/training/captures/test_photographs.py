@@ -29,6 +29,11 @@ def test_likely_pairs(partners):
     assert 40 * partners / 2 - partners**2 <= len(pairs) <= 40 * partners
 
 
+@pytest.mark.parametrize("partners", [1, 2])
+def test_few_partners_are_neighbors(partners):
+    assert likely_pairs(np.ones((9, 9)), partners) == [(a, a + 1) for a in range(8)]
+
+
 def test_features_of_a_database(tmp_path):
     rng = np.random.default_rng(2)
     scenes = [
