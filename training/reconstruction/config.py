@@ -27,9 +27,9 @@ class ReconstructConfig(Config):
     triangulated between the images of a capture without any, or "random" in the cameras' views;
     "auto" takes depth or, without it, points."""
     initial_gaussians: int = bounded(0, "[0, inf)")
-    """Maximum number of initial Gaussians. 0 takes as many as shape and texture need at the
-    resolution of the closest images, at most `max_gaussians`, if they start from depth, and 120,000
-    if they start at random."""
+    """Maximum number of initial Gaussians, at most `max_gaussians`. 0 takes as many as shape and
+    texture need at the resolution of the closest images, if they start from depth, or as there are
+    points, or 120,000 if they start at random."""
     max_gaussians: int = bounded(0, "[0, inf)")
     """Maximum number of Gaussians. 0 is 1,000,000, or `initial_gaussians` if more, if they start
     from depth and none are added, else 180,000. Without iterations, it sets how finely texture is

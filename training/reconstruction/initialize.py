@@ -241,11 +241,11 @@ def make_initial_gaussians(
     config: ReconstructConfig,
 ) -> GaussianScene:
     """Makes the Gaussians that `config` starts from; `extent` [m] is that of the cameras."""
-    kind = config.initialization
+    kind, most = config.initialization, config.max_gaussians
+    count = min(config.initial_gaussians or most, most)
     if kind == "depth":
         condition = f"points or random for {capture.name}"
         require(capture.has_depth, "initialization", condition, kind)
-        count = min(config.initial_gaussians or config.max_gaussians, config.max_gaussians)
         return gaussians_from_depth(frames, photometry, count, config.contrast, optimized=True)
     if kind == "points":
         points = capture.points
@@ -256,9 +256,11 @@ def make_initial_gaussians(
                 raise
             say(f"{error}; starting from random points")
         if points is not None:
-            return gaussians_from_points(points.p_WQ, points.colors)
+            order = np.random.default_rng(config.seed).permutation(len(points.p_WQ))
+            kept = np.sort(order[:count])
+            return gaussians_from_points(points.p_WQ[kept], points.colors[kept])
     near, far = (extent * depth for depth in _RANDOM_DEPTH)
-    count = config.initial_gaussians or _RANDOM
+    count = min(config.initial_gaussians or _RANDOM, most)
     return gaussians_from_points(*random_points(frames, count, near, far, config.seed))
 
 

@@ -12,6 +12,7 @@ from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.training.captures.capture import (
     Capture,
     CaptureFrame,
+    SfmPoints,
     no_depth,
     pixel_rays,
     project_points,
@@ -19,7 +20,11 @@ from splatpilot.training.captures.capture import (
 from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction import initialize
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.photometry import ThinnedFrame, estimate_photometry
+from splatpilot.training.reconstruction.photometry import (
+    Photometry,
+    ThinnedFrame,
+    estimate_photometry,
+)
 
 
 @pytest.mark.parametrize(
@@ -81,6 +86,27 @@ def test_the_maximum_number_of_gaussians_is_kept(capture):
     photometry = estimate_photometry([ThinnedFrame.of(frame) for frame in frames], 0)
     made = initialize.make_initial_gaussians(capture, frames, photometry, 1.0, config)
     assert len(made) <= 500
+
+
+@pytest.mark.parametrize("initialization", ["points", "random"])
+@pytest.mark.parametrize(
+    ("initial", "most", "expected"), [(0, 0, 300), (0, 200, 200), (100, 200, 100), (250, 200, 200)]
+)
+def test_points_keep_the_maximum_number(
+    capture, monkeypatch, initialization, initial, most, expected
+):
+    monkeypatch.setattr(initialize, "_RANDOM", 300)
+    p_WQ = np.random.default_rng(0).uniform(0, 5, (300, 3))
+    points = replace(capture, points=SfmPoints(p_WQ, p_WQ / 5))
+    config = ReconstructConfig(
+        initialization=initialization, initial_gaussians=initial, max_gaussians=most
+    )
+    config = initialize.resolve_config(config, points)
+    photometry, frames = Photometry(np.ones(len(capture)), 0.0), list(capture.frames())
+    made = initialize.make_initial_gaussians(points, frames, photometry, 1.0, config)
+    assert len(made) == expected
+    if initialization == "points":
+        np.testing.assert_allclose(made.base_colors, made.means / 5, atol=1e-5)
 
 
 def test_too_many_gaussians_to_optimize_are_sampled(capture, capsys):
