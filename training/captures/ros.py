@@ -58,7 +58,7 @@ _POSES = {
 }
 _TRANSPORTS = ("/compressed", "/compressedDepth", "/theora")
 _CAMERA = "camera.json"
-_VERSION = 3  # version of the cache's content; others are written again
+_VERSION = 4  # version of the cache's content; others are written again
 _MODELS = {"": opencv_lens, "plumb_bob": opencv_lens, "rational_polynomial": opencv_lens}
 _MODELS |= {"equidistant": fisheye_lens, "fisheye": fisheye_lens}
 
@@ -142,7 +142,8 @@ class _Bag:
                     )
                 poses.append((_time(message), _pose(pose_field(message), self._pose) @ X_BC))
         what = f"{self._path}: poses of {frame!r}, the frame of {self._color}, in {self._pose}"
-        require(len(poses) >= 2, what, "at least 2", len(poses))
+        remedy = f"record all transforms between {frame!r} and a frame that moves"
+        require(len(poses) >= 2, what, "at least 2", len(poses), remedy)
         lines = [f"{time:.9f} {pose_row(X_WC)}\n" for time, X_WC in poses]
         (folder / "groundtruth.txt").write_text("".join(lines))
         (folder / _CAMERA).write_text(json.dumps(self._calibration(frame)))
@@ -277,9 +278,10 @@ class TransformTree:
         return _compose(map(self._fixed.get, names[: names.index(ancestor)]))
 
     def pose(self, frame: str, time: float) -> RigidTransform | None:
-        """Returns the pose of a frame in its root at a time [s]; None if it is unknown then."""
+        """Returns the pose of a frame in its root at a time [s]; None if it is unknown then or if
+        no frame in between moves."""
         *names, root = self._upwards(frame)
-        if root in self._parents:
+        if root in self._parents or self._moving.keys().isdisjoint(names):
             return None
         return _compose(self._fixed.get(name) or self._interpolate(name, time) for name in names)
 
