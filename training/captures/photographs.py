@@ -276,7 +276,8 @@ def _extract_frames(path: Path, rate: float, folder: Path) -> None:
                 count += interval != current
                 current, sharpest = interval, sharpness
                 file = folder / f"{interval:05d}.jpg"
-                cv2.imwrite(str(file), frame, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+                if not cv2.imwrite(str(file), frame, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]):
+                    raise OSError(f"{file.name} is incomplete")
             index += 1
             progress.update()
     video.release()

@@ -93,6 +93,14 @@ def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path, monkeypatch):
     assert len(registered) == 20
 
 
+def test_frames_that_cannot_be_written_are_not_kept(tmp_path, monkeypatch):
+    write_video(tmp_path / "flight.mp4", 60, sharp=set())
+    monkeypatch.setattr(cv2, "imwrite", lambda *_: False)  # as on a full disk
+    with pytest.raises(OSError, match=r"frames: cannot be written .*; make room"):
+        read_capture(tmp_path / "flight.mp4", CaptureConfig(cache=str(tmp_path / "cache")))
+    assert not any(path.is_file() for path in (tmp_path / "cache").rglob("*"))
+
+
 def test_invalid_videos_are_refused(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"something else")
     write_video(tmp_path / "b.mp4", 20, sharp=set())
