@@ -146,11 +146,11 @@ def known_entries(data: Path | None = None) -> dict[str, Entry]:
     if (data / _ENTRIES).is_file():
         entries |= _read_entries(data / _ENTRIES)
     sources = {entry.source for entry in entries.values()}
-    for folder, suffixes in (("worlds", _MESHES), ("maps", (OCTOMAP,)), ("captures", ("",))):
-        for path in sorted((data / folder).glob("*")):
-            source = f"{folder}/{path.name}"
-            if path.suffix.lower() in suffixes and source not in sources:
-                entries.setdefault(path.stem, Entry(source=source))
+    for folder, suffixes in (("worlds", _MESHES), ("maps", (OCTOMAP,)), ("captures", ())):
+        for path in sorted((data / folder).glob("[!.]*")):
+            source, is_capture = f"{folder}/{path.name}", not suffixes and path.is_dir()
+            if (is_capture or path.suffix.lower() in suffixes) and source not in sources:
+                entries.setdefault(path.name if is_capture else path.stem, Entry(source=source))
     return entries
 
 

@@ -30,12 +30,17 @@ def test_folder_of_data_adds_entries(tmp_path):
     (tmp_path / "worlds/barn.glb").touch()
     (tmp_path / "worlds/shed.glb").touch()
     (tmp_path / "worlds/notes.txt").touch()
+    for name in ("hall", "walk_1.5m", ".hall.partial"):
+        (tmp_path / "captures" / name).mkdir(parents=True)
+    for name in (".DS_Store", "README"):
+        (tmp_path / "captures" / name).touch()
     (tmp_path / "environments.yaml").write_text(
         "barn: {source: worlds/barn.glb, split: test, settings: [render.up=z]}\n"
     )
     entries = known_entries(tmp_path)
     assert entries["barn"].config().render.up == "z" and entries["barn"].split == "test"
     assert entries["shed"].source == "worlds/shed.glb" and "notes" not in entries
+    assert entries.keys() - known_entries().keys() == {"barn", "shed", "hall", "walk_1.5m"}
     (tmp_path / "environments.yaml").write_text("barn: {sauce: worlds/barn.glb}\n")
     with pytest.raises(ValueError, match=r"environments.yaml: barn: .*sauce"):
         known_entries(tmp_path)
