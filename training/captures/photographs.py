@@ -231,21 +231,26 @@ def similarity(database: "pycolmap.Database", names: list[str]) -> NDArray[np.fl
     features = []
     for name in names:
         descriptors = database.read_descriptors(numbers[name])  # which `data` does not keep alive
-        features.append(np.sqrt(np.array(descriptors.data, dtype=np.float32)))  # RootSIFT
+        features.append(np.array(descriptors.data))
     rng = np.random.default_rng(0)
-    pool = np.concatenate(features)
-    sample = pool[rng.permutation(len(pool))[:_SAMPLE]]
+    pool = np.concatenate(features)  # of 8 bits: thousands of photographs have gigabytes
+    sample = _root_sift(pool[rng.permutation(len(pool))[:_SAMPLE]])
     words = min(_WORDS, len(sample))
     centers, _ = kmeans2(sample, words, iter=10, minit="points", rng=0)
     vectors = np.zeros((len(features), words, pool.shape[1]))
     for vector, descriptors in zip(vectors, features, strict=True):
         if len(descriptors):
+            descriptors = _root_sift(descriptors)
             nearest, _ = vq(descriptors, centers)
             np.add.at(vector, nearest, descriptors - centers[nearest])
     vectors /= np.linalg.norm(vectors, axis=2, keepdims=True) + 1e-12  # no word outweighs others
     flat = vectors.reshape(len(features), -1)
     flat /= np.linalg.norm(flat, axis=1, keepdims=True) + 1e-12
     return flat @ flat.T
+
+
+def _root_sift(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return np.sqrt(descriptors.astype(np.float32))
 
 
 def is_video(path: Path) -> bool:

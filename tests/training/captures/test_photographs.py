@@ -1,4 +1,6 @@
+import tracemalloc
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -54,6 +56,21 @@ def test_features_of_a_database(tmp_path):
     assert min(found[0, 1], found[2, 3]) > found[:2, 2:].max() + 0.2
     np.testing.assert_allclose(found, found.T, atol=1e-12)
     np.testing.assert_allclose(np.diag(found), [1, 1, 1, 1, 0], atol=1e-6)
+
+
+def test_features_of_many_photographs_fit_into_memory(monkeypatch):
+    rng = np.random.default_rng(0)
+    content = [rng.integers(0, 255, (4096, 128), dtype=np.uint8) for _ in range(16)]
+    database = SimpleNamespace(
+        read_all_images=lambda: [SimpleNamespace(name=str(i), image_id=i) for i in range(16)],
+        read_descriptors=lambda i: SimpleNamespace(data=content[i]),
+    )
+    monkeypatch.setattr(photographs, "_SAMPLE", 1000)
+    tracemalloc.start()
+    similarity(database, [str(i) for i in range(16)])
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 4 * sum(each.nbytes for each in content)
 
 
 def write_video(path, count: int, sharp: set[int]) -> list[np.ndarray]:
