@@ -35,7 +35,7 @@ from splatpilot.training.captures.capture import (
     resampling_maps,
 )
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.up_and_scale import turn_upright
+from splatpilot.training.captures.up_and_scale import make_metric, turn_upright
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
@@ -296,7 +296,7 @@ def open_frames(
     frames without their own; without `depth_camera` depth has the pixels of the images before they
     are undistorted or, if `stretch_depth`, another resolution. `read_depth` reads a file of
     `depth_unit` units per meter. `up` is that of the files' world, see `turn_upright`; empty leaves
-    it as it is. `dropped` are messages about frames left out already.
+    it and its scale as they are. `dropped` are messages about frames left out already.
     """
     config = config or CaptureConfig()
     messages, complete, missing = list(dropped), [], 0
@@ -391,7 +391,11 @@ def open_frames(
         notes=[*notes, *_notes(distinct, masked, transparent, len(usable))],
         axes=axes,
     )
-    return turn_upright(capture, config.up or up) if up else capture
+    if not up:
+        return capture
+    if config.scale.sources():
+        capture = make_metric(capture, config.scale)
+    return turn_upright(capture, config.up or up)
 
 
 def _notes(lenses: Sequence[Lens], masked: int, transparent: int, total: int) -> list[str]:

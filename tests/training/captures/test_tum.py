@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from room import assert_shows_room, room_views
 
+from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
 from splatpilot.training.captures.capture_registry import read_capture
 
 FX, CX = 525.0, 320.0
@@ -36,6 +37,15 @@ def test_room(sequence):
     capture = read_capture(sequence)
     assert len(capture) == 10 and not capture.dropped
     assert_shows_room(capture, color=0.5, depth=0.001)
+
+
+def test_positions_in_other_units_are_scaled(sequence):
+    file = sequence / "groundtruth.txt"
+    rows = np.loadtxt(file)
+    rows[:, 1:4] *= 100
+    np.savetxt(file, rows, fmt="%.6f")
+    config = CaptureConfig(scale=ScaleConfig(factor=0.01))
+    assert_shows_room(read_capture(sequence, config), color=0.5, depth=0.001)
 
 
 @pytest.mark.parametrize(
