@@ -8,7 +8,7 @@ import re
 import unicodedata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from os.path import isfile
 from pathlib import Path
 from typing import Any
@@ -291,14 +291,19 @@ def open_frames(
 ) -> Capture:
     """Opens frames, whose images and depths are read on demand.
 
-    `intrinsics`, `depth_unit` and `up` of `config` replace those of the format. `lens` and
-    `depth_camera` return the cameras of images and depth images of a width and height [px], for
-    frames without their own; without `depth_camera` depth has the pixels of the images before they
-    are undistorted or, if `stretch_depth`, another resolution. `read_depth` reads a file of
-    `depth_unit` units per meter. `up` is that of the files' world, see `turn_upright`; empty leaves
-    it and its scale as they are. `dropped` are messages about frames left out already.
+    `intrinsics`, `depth_intrinsics`, `p_DC`, `depth_unit` and `up` of `config` replace those of the
+    format. `lens` and `depth_camera` return the cameras of images and depth images of a width and
+    height [px], for frames without their own; without `depth_camera` depth has the pixels of the
+    images before they are undistorted or, if `stretch_depth`, another resolution. `read_depth`
+    reads a file of `depth_unit` units per meter. `up` is that of the files' world, see
+    `turn_upright`; empty leaves it and its scale as they are. `dropped` are messages about frames
+    left out already.
     """
     config = config or CaptureConfig()
+    if depth_camera is None and config.depth_intrinsics:
+        X_CD = RigidTransform(-np.array(config.p_DC or [0.0, 0.0, 0.0]))
+        depth_camera = partial(DepthCamera, pinhole(*config.depth_intrinsics), X_CD=X_CD)
+        stretch_depth = False
     messages, complete, missing = list(dropped), [], 0
     for files in frames:
         try:

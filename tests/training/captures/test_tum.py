@@ -1,7 +1,8 @@
 import cv2
 import numpy as np
 import pytest
-from room import assert_shows_room, room_views
+from pydrake.math import RigidTransform
+from room import CAMERA_POSES, assert_shows_room, room_views
 
 from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
 from splatpilot.training.captures.capture_registry import read_capture
@@ -37,6 +38,16 @@ def test_room(sequence):
     capture = read_capture(sequence)
     assert len(capture) == 10 and not capture.dropped
     assert_shows_room(capture, color=0.5, depth=0.001)
+
+
+def test_depth_of_a_separate_camera_is_registered(sequence):
+    K_D, X_DC = np.array([[55.0, 0, 32], [0, 55, 24], [0, 0, 1]]), RigidTransform([0.2, -0.1, 0])
+    poses = [X_WC @ X_DC.inverse() for X_WC in CAMERA_POSES]
+    files = sorted((sequence / "depth").iterdir())
+    for file, view in zip(files, room_views(K_D, 64, 48, poses), strict=True):
+        cv2.imwrite(str(file), np.round(5000 * view.depth).astype(np.uint16))
+    config = CaptureConfig(depth_intrinsics=[55, 55, 32, 24], p_DC=[0.2, -0.1, 0])
+    assert_shows_room(read_capture(sequence, config), color=0.5, depth=0.01)
 
 
 def test_positions_in_other_units_are_scaled(sequence):
