@@ -363,7 +363,8 @@ def make_scene(
             summary = reconstruct(opened, out, config, restart=restart)
         summary = replace(summary, warnings=(*doubted, *summary.warnings))
         print(summary)
-        with resumable(lambda: f"{out} is made, but not measured; the same command measures it"):
+        measure = f"`splatpilot scene measure {out}` measures it"
+        with resumable(lambda: f"{out} is made, but not measured; {measure}"):
             metrics = measure_scene(out, opened)
         print(metrics)
     return summary, metrics

@@ -1,6 +1,8 @@
 import json
+import re
 from dataclasses import replace
 from itertools import product
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -10,6 +12,7 @@ from pydrake.math import RigidTransform
 
 import splatpilot as sp
 from splatpilot.analysis.commands.main import main
+from splatpilot.analysis.reconstruction import measure_scene as measure
 from splatpilot.analysis.reconstruction.measure_scene import (
     SceneMetrics,
     SceneViews,
@@ -198,6 +201,16 @@ def test_settings_of_a_capture_stay_with_its_scene(folder, config, tmp_path, cap
     assert main(["scene", "measure", str(scene), "--overwrite"]) == 1
     message = capsys.readouterr().err
     assert "scene.yaml: capture_settings: " in message and "did you mean depth_unit" in message
+
+
+def test_an_interrupted_measurement_is_resumed_alone(folder, config, tmp_path, monkeypatch):
+    scene = tmp_path / "scene"
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt) as interrupted:
+        patch.setattr(measure, "measure_scene", Mock(side_effect=KeyboardInterrupt))
+        make_scene(capture=folder, out=scene, config=replace(config, iterations=2))
+    command = re.search(r"not measured; `splatpilot (.*)` measures", interrupted.value.__notes__[0])
+    assert command and main(command[1].split()) == 0
+    assert (scene / "metrics.json").is_file() and (scene / "views.png").is_file()
 
 
 def test_doubts_about_a_capture_are_printed_first_and_last(folder, config, tmp_path, capsys):
