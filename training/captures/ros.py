@@ -174,7 +174,8 @@ class _Bag:
         if message is None:
             return ""
         if hasattr(message, "format"):
-            return "depth" if "compressedDepth" in message.format else "color"
+            is_depth = "compressedDepth" in message.format or message.format.startswith("16UC1")
+            return "depth" if is_depth else "color"
         if message.encoding in _DEPTHS:
             return "depth"
         return "color" if message.encoding in _COLORS else ""
@@ -326,12 +327,14 @@ def _encode_color(message: Any) -> tuple[str, bytes]:
 def _encode_depth(message: Any) -> tuple[str, bytes]:
     """Returns planar depth as a PNG of 16 bits in millimeters, 0 if unknown."""
     if hasattr(message, "format"):
-        # A header of an enumeration and two floats, then a PNG, which holds floats as 1 / depth.
-        _, a, b = struct.unpack("<iff", bytes(message.data[:12]))
-        depth = cv2.imdecode(np.asarray(message.data[12:], np.uint8), cv2.IMREAD_UNCHANGED)
+        # compressedDepth: an enumeration, two floats and a PNG, which holds floats as 1 / depth.
+        has_header = "compressedDepth" in message.format
+        content = np.asarray(message.data[12 if has_header else 0 :], np.uint8)
+        depth = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
         if depth is None:
             raise ValueError("no PNG")
-        if "32FC1" in message.format:
+        if has_header and "32FC1" in message.format:
+            _, a, b = struct.unpack("<iff", bytes(message.data[:12]))
             inverse = depth.astype(np.float32) - np.float32(b)
             depth = np.where(depth > 0, np.float32(a) / np.maximum(inverse, 1e-6), 0)
     else:

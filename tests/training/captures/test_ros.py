@@ -53,7 +53,7 @@ class Bag:
         raw = serialize(self.message(kind, *first, *values), kind)
         self._writer.write(self._connections[topic], int(1e9 * time), raw)
 
-    def images(self, compressed=False, depth32=False, color: str = "/color") -> None:
+    def images(self, compressed=False, depth32=False, plain=False, color="/color") -> None:
         for i, view in enumerate(self.views):
             time, depth = START + i / 30, view.depth.astype(np.float32)
             millimeters = np.round(1000 * depth).astype(np.uint16)
@@ -67,6 +67,8 @@ class Bag:
                 parameters = np.frombuffer(struct.pack("<iff", 0, a, b), np.uint8)
                 packed = np.concatenate([parameters, cv2.imencode(".png", stored)[1].ravel()])
                 text = f"{'32FC1' if depth32 else '16UC1'}; compressedDepth"
+                if plain:  # as the transport "compressed" writes depth
+                    packed, text = packed[12:], "16UC1; png compressed "
                 self.write("/depth/compressedDepth", kind, time + 0.004, FRAME, text, packed)
                 continue
             padded = np.zeros((48, 66, 3), np.uint8)  # rows of 6 bytes more
@@ -153,6 +155,7 @@ def config(tmp_path):
         ("transforms", {}),
         ("odometry", {"compressed": True}),
         ("odometry", {"compressed": True, "depth32": True}),
+        ("odometry", {"compressed": True, "plain": True}),
     ],
 )
 def test_room(bag, config, version, poses, images):
