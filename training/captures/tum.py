@@ -167,7 +167,7 @@ def _read_list(file: Path) -> tuple[NDArray[np.float64], list[str]]:
         if not line.strip() or line.startswith("#"):
             continue
         try:
-            time, name = line.split(maxsplit=1)
+            time, name = line.strip().split(maxsplit=1)
             times.append(float(time))
         except ValueError:
             raise ValueError(

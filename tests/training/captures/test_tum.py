@@ -40,6 +40,13 @@ def test_room(sequence):
     assert_shows_room(capture, color=0.5, depth=0.001)
 
 
+def test_spaces_around_names_are_ignored(sequence):
+    for name in ("rgb", "depth"):
+        file = sequence / f"{name}.txt"
+        file.write_text(file.read_text().replace(".png\n", ".png \n"))
+    assert len(read_capture(sequence)) == 10
+
+
 def test_depth_of_a_separate_camera_is_registered(sequence):
     K_D, X_DC = np.array([[55.0, 0, 32], [0, 55, 24], [0, 0, 1]]), RigidTransform([0.2, -0.1, 0])
     poses = [X_WC @ X_DC.inverse() for X_WC in CAMERA_POSES]
