@@ -23,7 +23,7 @@ from splatpilot.training.captures.capture import (
     project,
     project_points,
 )
-from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
 from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.captures.epipolar import epipolar_errors, match_frames
 
@@ -285,7 +285,9 @@ def _check_features(capture: Capture, pairs: int) -> CheckReport:
     zoomed = [(z * focal, as_read.K @ np.diag([z, z, 1.0])) for z in _ZOOMS]
     error, other = min((measure(replace(as_read, K=K)).error, f) for f, K in zoomed)
     fits = error < max(2.0 * agreement.error, _NEGLIGIBLE)
-    if fits and not problem and not capture.config.intrinsics:
+    folder, config = capture.folder, capture.config
+    given = complete_config(Path(folder), config) if folder else config
+    if fits and not problem and not given.intrinsics:
         angle = 2.0 * np.degrees(np.arctan2(capture.width / 2, focal))
         undetermined = (
             f"these frames do not tell the focal length: {other:.0f} px fits about as well as "

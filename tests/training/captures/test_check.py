@@ -191,7 +191,7 @@ def test_features_without_depth_tell_errors_apart(flight, change, problem):
     assert not report.undetermined
 
 
-def test_flight_along_the_optical_axis_leaves_the_focal_length_open():
+def test_flight_along_the_optical_axis_leaves_the_focal_length_open(tmp_path):
     forward = tiled_flight(turn=0.0, aside=0.0)
     for focal, angle in ((160, 90), (960, 19)):
         report = check_capture(replace(forward, K=pinhole(focal, focal, 160, 120)), pairs=4)
@@ -201,6 +201,8 @@ def test_flight_along_the_optical_axis_leaves_the_focal_length_open():
     assert doubt.endswith("or set capture.intrinsics")
     given = CaptureConfig(intrinsics=[160.0, 160.0, 160.0, 120.0])
     assert not check_capture(replace(forward, config=given), pairs=4).undetermined
+    (tmp_path / "capture.yaml").write_text("intrinsics: [160, 160, 160, 120]\n")
+    assert not check_capture(replace(forward, folder=str(tmp_path)), pairs=4).undetermined
 
 
 def test_command(tmp_path, capsys):
