@@ -79,8 +79,14 @@ class RenderConfig(Config):
         require_field(self, "lowest", self.lowest < self.highest, f"below highest, {self.highest}")
         require_field(self, "inside", len(self.inside) in (0, 3), "x, y, z, or empty")
         require_field(self, "yaws", self.yaws, "at least one angle")
-        require_field(self, "offsets", all(self.offsets), "other than 0")
+        distinct = len(set(map(_offset_folder, self.offsets))) == len(self.offsets)
+        valid = all(self.offsets) and distinct
+        require_field(self, "offsets", valid, "other than 0, and different in centimeters")
         require_field(self, "background", len(self.background) == 3, "red, green and blue")
+
+
+def _offset_folder(offset: float) -> str:
+    return f"offset_{offset:+.2f}"
 
 
 RECIPE = "world.yaml"
@@ -175,7 +181,7 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
     for offset in config.offsets:
         moved = [X_WC @ RigidTransform(np.array([-offset, 0.0, 0.0])) for X_WC in X_WCs]
         free = [X_WC for X_WC in moved if _is_free(esdf, X_WC.translation(), config.clearance)]
-        _write_frames(partial / f"offset_{offset:+.2f}", f"offset {offset:+.2f} m", free, view)
+        _write_frames(partial / _offset_folder(offset), f"offset {offset:+.2f} m", free, view)
     if plan is not None:
         _write_png(partial / COVERAGE, plan.picture())
     if out.exists():

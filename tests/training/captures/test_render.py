@@ -138,6 +138,12 @@ def test_renamed_copy_of_a_test_mesh_is_of_split_test(opengl, room, tmp_path, mo
     assert read_scene_metadata(tmp_path / "scene").split == "test"
 
 
+@pytest.mark.parametrize("offsets", [[0.0], [0.101, 0.104]])
+def test_offsets_have_folders_of_their_own(offsets):
+    with pytest.raises(ValueError, match=r"offsets must be other than 0, and different"):
+        RenderConfig(offsets=offsets).validate()
+
+
 def test_bad_input_is_named(room, tmp_path, capsys):
     (tmp_path / "world.stl").write_bytes(b"x")
     (tmp_path / "damaged.glb").write_bytes(b"x")
