@@ -163,7 +163,7 @@ def _warnings(rows: list[Row], absent: dict[str, str], damaged: list[str]) -> st
 
 
 _MEANS = {
-    "min. clearance [m]": ("min_clearance_m", "+.2f"),
+    "min. clearance [m]": ("min_clearance_m", "+z.2f"),
     "velocity [m/s]": ("mean_speed_m_s", ".2f"),
     "path excess": ("path_excess", ".1%"),
     "jerk [m/s³]": ("jerk_m_s3", ".1f"),
@@ -206,7 +206,7 @@ def _paper(table: list[Row], paper: dict[str, PaperRow]) -> str:
         name = f"{row['policy']} at {row['speed']:g} m/s"
         rate = f"{theirs.successes}/{PAPER_FLIGHTS} ({theirs.successes / PAPER_FLIGHTS:.0%})"
         cells = [name, theirs.method, rate, *_success_cells(row)]
-        for metric, form in (("min_clearance_m", "+.2f"), ("mean_speed_m_s", ".2f")):
+        for metric, form in (("min_clearance_m", "+z.2f"), ("mean_speed_m_s", ".2f")):
             cells += [f"{getattr(theirs, metric):{form}}", _number(row[metric], form)]
         rows.append(cells)
     return _table(header, rows) + _note(
@@ -278,7 +278,7 @@ def _flights(config: StudyConfig, rows: list[Row]) -> str:
         if ":" in each.policy
     }
     header = ["flight", "outcome", "time [s]", "min. clearance [m]", "velocity [m/s]", "replay"]
-    columns = {"flight_time_s": ".1f", "min_clearance_m": "+.2f", "mean_speed_m_s": ".2f"}
+    columns = {"flight_time_s": ".1f", "min_clearance_m": "+z.2f", "mean_speed_m_s": ".2f"}
     sections = [
         "<p>The commands run in the folder that holds this report; each writes the page that its "
         "flight links to.</p>"

@@ -35,6 +35,7 @@ from splatpilot.analysis.benchmark.tables import (
     external_table,
     format_table,
     policy_table,
+    scenario_table,
 )
 from splatpilot.analysis.benchmark.variants import SCENARIO, ScenarioVariant
 from splatpilot.diagrams.flight.policies import DEFAULT_SPEED, POLICIES, at_speed, policy_speed
@@ -360,6 +361,7 @@ def _conclude(
 ) -> None:
     timings = [folder.read_timing(row["id"]) for row in rows]
     tables = {"rollouts.csv": rows, "timings.csv": timings, "table.csv": table}
+    tables["scenarios.csv"] = scenario_table(rows, config)
     if pairs := compare(rows, config):
         tables["pairs.csv"] = [pair._asdict() for pair in pairs]
     if external := external_table(rows, config):

@@ -7,7 +7,7 @@
     rollouts/        trajectory and metrics of each flight
     timings/         times and machine of each flight, which differ between runs of a study
     errors/          traceback of a flight that stopped the study
-    rollouts.csv, timings.csv, table.csv, pairs.csv, report.html
+    rollouts.csv, timings.csv, table.csv, scenarios.csv, pairs.csv, report.html
     external.csv     for scenarios with published results
 
 Files are written atomically; a flight is complete if its file in `rollouts/` exists.

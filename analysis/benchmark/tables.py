@@ -257,6 +257,22 @@ def policy_table(rows: list[Row], config: StudyConfig, absent: int = 0) -> list[
     return table
 
 
+def scenario_table(rows: list[Row], config: StudyConfig) -> list[Row]:
+    """Returns a row for each policy, speed and scenario: the scenario's changed fields, successes
+    with Wilson's interval, and the means of `METRICS`."""
+    table, keys = [], product(config.policy_names, config.speeds, config.scenario_variants)
+    for policy, speed, scenario in keys:
+        if flown := select(rows, policy=policy, speed=speed, scenario=scenario.label):
+            worlds, successes = _count(flown, _world), sum(row["success"] for row in flown)
+            table.append(
+                {"policy": policy, "speed": speed, "scenario": scenario.label}
+                | {name: flown[0].get(name) for name in scenario.fields}
+                | _success(successes, len(flown), effective_flights(*worlds))
+                | {name: mean_column(flown, name) for name in METRICS}
+            )
+    return table
+
+
 def external_table(rows: list[Row], config: StudyConfig) -> list[Row]:
     """Returns, for each published scenario that a study flies unchanged, a row for each published
     result, and then for each of the study's policies and speeds."""
@@ -337,6 +353,7 @@ def format_table(table: list[Row], config: StudyConfig) -> str:
         )
         lines.append(
             f"{row['policy']:<{width}}{row['speed']:>6g}{rate:>12}{these:>16}{new:>16}{passed:>11}"
-            f"{row['min_clearance_m']:>+9.2f} m{row['mean_speed_m_s']:>6.2f} m/s{row['not_run']:>9}"
+            f"{row['min_clearance_m']:>+z9.2f} m{row['mean_speed_m_s']:>6.2f} m/s"
+            f"{row['not_run']:>9}"
         )
     return "\n".join(lines)

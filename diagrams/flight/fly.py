@@ -265,7 +265,7 @@ def format_summary(summary: dict[str, float | str]) -> str:
         ("flight time", "flight_time_s", "{:.2f} s"),
         ("path length", "path_length_m", "{:.2f} m"),
         ("mean speed", "mean_speed_m_s", "{:.2f} m/s"),
-        ("minimum clearance", "min_clearance_m", "{:+.3f} m"),
+        ("minimum clearance", "min_clearance_m", "{:+z.3f} m"),
         ("unobserved pixels", "unobserved_fraction", "{:.1%}"),
         ("real-time factor", "real_time_factor", "{:.1f}"),
         ("render", "render_ms", "{:.1f} ms"),

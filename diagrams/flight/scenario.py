@@ -234,8 +234,9 @@ def _check_free(world: World, what: str, p_WQ: np.ndarray, radius: float) -> Non
     if sample.state >= FieldState.UNKNOWN:
         known = "outside the world" if sample.state == FieldState.OUTSIDE else "in unseen space"
         raise InfeasibleFlightError(
-            f"{where} is {known}, which spans {np.round(field.lower_W, 2).tolist()} to "
-            f"{np.round(field.upper_W, 2).tolist()} m; choose a point in known free space"
+            f"{where} is {known}; the world spans {np.round(field.lower_W, 2).tolist()} to "
+            f"{np.round(field.upper_W, 2).tolist()} m: choose a point in known free space, if "
+            "`splatpilot view` shows any"
         )
     if sample.distance <= radius or sample.state != FieldState.FREE:
         raise InfeasibleFlightError(

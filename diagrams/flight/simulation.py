@@ -73,7 +73,7 @@ class Flight:
     def __repr__(self) -> str:
         return (
             f"Flight({self.outcome} after {self.times[-1]:.2f} s, "
-            f"min. clearance {np.nanmin(self.clearances):+.2f} m)"
+            f"min. clearance {np.nanmin(self.clearances):+z.2f} m)"
         )
 
     def _repr_html_(self) -> str:

@@ -135,7 +135,7 @@ def require_unused(path: Path, overwrite: bool) -> None:
         used = any(_LEFTOVER.fullmatch(file.name) is None for file in path.iterdir())
     if used and not overwrite:
         raise FileExistsError(
-            f"{path} is there already; choose another, or replace it with --overwrite"
+            f"{path} is there already; choose another --out, or replace it with --overwrite"
         )
 
 

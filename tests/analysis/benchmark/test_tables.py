@@ -14,6 +14,7 @@ from splatpilot.analysis.benchmark.tables import (
     mcnemar,
     paper_rows,
     policy_table,
+    scenario_table,
     sign_flip,
     success_summary,
     wilson_interval,
@@ -151,6 +152,14 @@ def test_flights_that_share_worlds_are_clustered():
     assert (table[0]["wilson_lower"], table[0]["wilson_upper"]) == wilson_interval(10, 10)
     assert table[1]["wilson_lower"] == pytest.approx(wilson_interval(3.6, 9).lower)
     assert (table[1]["cluster_lower"], table[1]["cluster_upper"]) == (0.0, 1.0)
+    labels = [each.label for each in config.scenario_variants]
+    drags = dict(zip(labels, (0.3, 0.5), strict=True))
+    rows = [row | {"vehicle.drag": drags[row["scenario"]]} for row in rows]
+    table = scenario_table(rows, config)
+    assert [(row["policy"], row["vehicle.drag"], row["successes"]) for row in table] == [
+        *(("a", 0.3, 10), ("a", 0.5, 10), ("b", 0.3, 4), ("b", 0.5, 4))
+    ]
+    assert table[2]["wilson_lower"] == pytest.approx(wilson_interval(4, 10).lower)
 
 
 def test_paper_is_compared_with_unchanged_policies_in_all_scenarios():

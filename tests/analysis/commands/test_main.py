@@ -84,7 +84,7 @@ RENDER = (
         ("view room.ksplat", "room.ksplat: a KSPLAT; convert it to PLY"),
         ("view scene --seed 1", "--seed must be of a generated world"),
         ("view scene --set world.length=3", "--set must be of a scenario or a capture"),
-        ("view fast.yaml --out fast.yaml", "fast.yaml is there already; choose another, or repl"),
+        ("view fast.yaml --out fast.yaml", "fast.yaml is there already; choose another --out"),
         ("fly --graphviz fast.yaml", "fast.yaml is there already"),
         ("hardware vehicle --out scene", "scene is there already"),
         ("hardware bridge --log fast.yaml", "fast.yaml is there already"),

@@ -83,7 +83,7 @@ def test_existing_output_stays_unless_overwritten(words, file, room, monkeypatch
     room.scene("scene")
     (room.folder / file).write_text("old")
     assert main(words.split()) == 1
-    assert "is there already; choose another, or replace it" in capsys.readouterr().err
+    assert "is there already; choose another --out, or replace it" in capsys.readouterr().err
     assert (room.folder / file).read_text() == "old"
     assert main([*words.split(), "--overwrite"]) == 0
     assert (room.folder / file).read_text() != "old"
