@@ -30,7 +30,7 @@ from splatpilot.analysis.reconstruction.measure_scene import (
     measure_scene,
     read_metrics,
 )
-from splatpilot.diagrams.flight.flight_diagram import MakeCamera
+from splatpilot.diagrams.flight.blocks import MakeCamera
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds.file_worlds import OCTOMAP, OctomapConfig

@@ -19,7 +19,7 @@ from playwright.sync_api import Page, sync_playwright
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraConfig
 
-from splatpilot.diagrams.flight.flight_diagram import MakeCamera
+from splatpilot.diagrams.flight.blocks import MakeCamera
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.flight.sensors import make_onboard_camera
 from splatpilot.diagrams.scenarios import benchmark_scenarios

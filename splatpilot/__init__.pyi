@@ -1,4 +1,5 @@
 from .analysis.benchmark.run_study import study
+from .diagrams.flight.blocks import MakeCamera
 from .diagrams.flight.flight_diagram import (
     AddFlight,
     AddMeshcat,
@@ -7,7 +8,6 @@ from .diagrams.flight.flight_diagram import (
     BuildFlightDiagram,
     ExportFlight,
     FlightParts,
-    MakeCamera,
     open_meshcat,
 )
 from .diagrams.flight.fly import flight_page

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -15,9 +16,10 @@ from pydrake.systems.framework import (
     System,
 )
 from pydrake.systems.primitives import ConstantVectorSource
+from pydrake.systems.sensors import CameraConfig, CameraInfo
 
 from splatpilot.diagrams.flight.policies import POLICIES
-from splatpilot.diagrams.flight.scenario import Scenario, policy_rate
+from splatpilot.diagrams.flight.scenario import Scenario, policy_rate, sample_scenario
 from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig, make_onboard_camera
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
@@ -38,6 +40,7 @@ from splatpilot.systems.sensing.noise import ColorNoise, DepthNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.time_of_flight import TimeOfFlightGrid, equivalent_sensor
 from splatpilot.systems.splats.moving_bodies import MovingBodies
+from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.state import StateToPose
 from splatpilot.systems.vehicle.wind import DrydenWind
@@ -454,3 +457,30 @@ def AddSensors(
             port = sensor.get_output_port(index)
             measured[f"{name}_{port.get_name()}"] = port
     return added, measured
+
+
+def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
+    """Makes the scenario's camera of the world's Gaussians."""
+    config = sample_scenario(scenario).camera
+    return SplatCamera(
+        world.baked,
+        camera_info(config),
+        camera_mount(config),
+        min_depth=config.z_near,
+        max_depth=config.z_far,
+        near=config.clipping_near,
+        far=config.clipping_far,
+        background=world.background,
+        latency=config.output_delay,
+    )
+
+
+def camera_info(config: CameraConfig) -> CameraInfo:
+    """Returns the intrinsics of a camera."""
+    focal, center = (config.focal_x(), config.focal_y()), config.principal_point()
+    return CameraInfo(config.width, config.height, *focal, *center)
+
+
+def camera_mount(config: CameraConfig) -> RigidTransform:
+    """Returns X_BC, the pose of a camera in the vehicle's body frame."""
+    return config.X_PB.GetDeterministicValue() @ config.X_BC.GetDeterministicValue()

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams, SceneGraph
-from pydrake.math import RigidTransform
 from pydrake.systems.framework import (
     Diagram,
     DiagramBuilder,
@@ -16,7 +15,6 @@ from pydrake.systems.framework import (
     System,
 )
 from pydrake.systems.primitives import ConstantVectorSource
-from pydrake.systems.sensors import CameraConfig, CameraInfo
 
 from splatpilot.diagrams.flight.blocks import (
     AddDelayedPose,
@@ -30,6 +28,7 @@ from splatpilot.diagrams.flight.blocks import (
     ConnectOrExport,
     DecisionInput,
     ExportCollision,
+    MakeCamera,
     add_system,
     decision_period,
     make_policy,
@@ -599,30 +598,3 @@ def AddRerun(builder: DiagramBuilder, parts: FlightParts, path: Path) -> RerunSi
         camera=parts.camera,
         period=1 / parts.scenario.camera.fps,
     )
-
-
-def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
-    """Makes the scenario's camera of the world's Gaussians."""
-    config = sample_scenario(scenario).camera
-    return SplatCamera(
-        world.baked,
-        camera_info(config),
-        camera_mount(config),
-        min_depth=config.z_near,
-        max_depth=config.z_far,
-        near=config.clipping_near,
-        far=config.clipping_far,
-        background=world.background,
-        latency=config.output_delay,
-    )
-
-
-def camera_info(config: CameraConfig) -> CameraInfo:
-    """Returns the intrinsics of a camera."""
-    focal, center = (config.focal_x(), config.focal_y()), config.principal_point()
-    return CameraInfo(config.width, config.height, *focal, *center)
-
-
-def camera_mount(config: CameraConfig) -> RigidTransform:
-    """Returns X_BC, the pose of a camera in the vehicle's body frame."""
-    return config.X_PB.GetDeterministicValue() @ config.X_BC.GetDeterministicValue()

@@ -13,10 +13,9 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram
 
+from splatpilot.diagrams.flight.blocks import camera_info, camera_mount
 from splatpilot.diagrams.flight.flight_diagram import (
     BuildFlightDiagram,
-    camera_info,
-    camera_mount,
     check_drawings,
     open_meshcat,
 )

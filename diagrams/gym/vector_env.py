@@ -16,7 +16,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo
 
 from splatpilot import _native
-from splatpilot.diagrams.flight.flight_diagram import camera_info, camera_mount
+from splatpilot.diagrams.flight.blocks import camera_info, camera_mount
 from splatpilot.diagrams.flight.monitor import ENDS, Outcome
 from splatpilot.diagrams.flight.scenario import (
     Scenario,

@@ -315,7 +315,8 @@ class MovingBodiesVisualizer(LeafSystem):
         bodies = cast(Bodies, self.get_input_port().Eval(context))
         time, first = bodies.time, len(bodies.radii) - len(bodies.tracks)
         for k, (center, radius) in enumerate(zip(bodies.centers(time), bodies.radii, strict=True)):
-            path, is_new = f"{self._path}/{k}", not self._meshcat.HasPath(f"{self._path}/{k}")
+            path = f"{self._path}/{k}"
+            is_new = not self._meshcat.HasPath(path)
             if k >= first:
                 track = bodies.tracks[k - first]
                 X_WO = track.pose(time)

@@ -217,7 +217,7 @@ def test_meshcat_draws_each_flight_by_its_own_systems(open_world):
     waypoint = visualizer.GetInputPort("waypoint").Eval(visualizer.GetMyContextFromRoot(root))
     assert abs(waypoint[1]) < 0.5 < waypoint[0]
     assert meshcat.HasPath("/splatpilot/three/vehicle/policy_camera/frustum")
-    assert meshcat.HasPath("/splatpilot/two/moving/0")  # the first, of which it knows
+    assert meshcat.HasPath("/splatpilot/two/moving/0")  # the vehicle of the flight `flight`
 
 
 def test_spheres_of_a_scenario_move(post_world):
