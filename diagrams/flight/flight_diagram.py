@@ -119,9 +119,9 @@ class FlightParts(NamedTuple):
         monitor: Ends the flight.
         state: (13), the true state.
         pose: The true X_WB.
-        goal: (3) p_WG [m].
+        goal: p_WG (3) [m].
         decision: Of the policy: `hypotheses` or one of `DECISIONS`.
-        command: (4) to the vehicle: thrust [m/s^2], body rates [rad/s].
+        command: To the vehicle (4): thrust [m/s^2], body rates [rad/s].
         observation: Inputs of the policy by name.
         measured: Outputs of sensors by name.
         systems: All that the flight added.

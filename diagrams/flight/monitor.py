@@ -191,7 +191,7 @@ def AddFlightMonitor(
 
     Args:
         state: (13), the true one; command: (4).
-        goal: (3) p_WG [m]; by default a source `goal` of the scenario's.
+        goal: p_WG (3) [m]; by default a source `goal` of the scenario's.
         collision: an `EsdfCollision`; by default one named `collision` of the world's field.
         hypotheses: plans to log, every `plan_period` [s].
         logs: adds the logs.
